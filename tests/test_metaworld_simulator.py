@@ -134,11 +134,31 @@ def test_bodies_names_what_moves_and_sees_a_hinge_turn(simulator):
     env = simulator._env
     env.data.joint("doorjoint").qpos[:] = -0.5
     simulator.step(np.zeros(4))
-    assert set(closed) == {"eef", "door_link"}
+    assert set(closed) == {"eef", "door_link", "door_link.handle", "goal"}
     assert simulator.bodies()["door_link"].distance_m(closed["door_link"]) > 0.05
     for name, moving in (("hammer-v3", {"hammerbody", "nail_link"}), ("stick-push-v3", {"stick", "object"})):
         simulator.reset(task(name), Reset(seed=3))
-        assert set(simulator.bodies()) - {"eef"} == moving
+        assert {n for n in simulator.bodies() if "." not in n} - {"eef", "goal"} == moving
+
+
+def test_marks_are_the_handled_point_and_where_it_belongs(simulator):
+    from lerobot_roborecover.build.metaworld_experts import expert
+
+    for name, body in (
+        ("basketball-v3", "bsktball"),
+        ("coffee-button-v3", "cmbutton"),
+        ("hammer-v3", "hammerbody"),
+    ):
+        simulator.reset(task(name), Reset(seed=3))
+        act, reached = expert(simulator, name), []
+        for t in range(150):
+            simulator.step(act(t))
+            found = simulator.bodies()
+            reached.append(found["eef"].distance_m(found[f"{body}.handle"]))
+            if simulator.succeeded():
+                break
+        assert min(reached) < 0.13, name
+        assert found[f"{body}.handle"].distance_m(found["goal"]) < 0.1, name
 
 
 def test_steps_beyond_500_neither_raise_nor_reset(simulator):

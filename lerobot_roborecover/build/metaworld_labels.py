@@ -51,7 +51,8 @@ OTHER_TOUCHED_M = 0.06
 LOST_M = 0.05
 
 _FINAL_OFFSET_M = {"assembly-v3": (0.13, 0.0, 0.0), "hammer-v3": (-0.16, -0.09, 0.0)}
-"""Where the handled point is relative to the observation's goal once the task is done (zero elsewhere)."""
+"""Where the handled point is relative to the observation's goal once the task is done, for the tasks of the
+shipped set (`simulators/metaworld_marks.py` has more); zero elsewhere."""
 _OTHER_PARTS = ("nail_link", "cmbutton")
 
 

@@ -13,6 +13,9 @@ from lerobot_roborecover.scenario import Pose, Reset, Task
 type Observation = dict[str, Any]
 """LeRobot's raw observation of the platform: nested dicts of arrays, before any processor."""
 
+HANDLE, GOAL = ".handle", "goal"
+"""Names of marks among the bodies; see `Simulator.bodies`."""
+
 
 class SimulatorError(RuntimeError):
     """The simulator cannot do what was asked; the message says what, why and the remedy."""
@@ -54,7 +57,11 @@ class Simulator(Protocol):
         """The task's own success predicate, nothing else."""
 
     def bodies(self) -> dict[str, Pose]:
-        """World poses; names that start with `eef` are end effectors, the rest whatever else can move."""
+        """World poses; names that start with `eef` are end effectors, the rest whatever else can move.
+
+        A platform may add two marks without a direction of their own: `<body>` + `HANDLE`, the point of a
+        body that the task is about, and `GOAL`, where the task wants that point.
+        """
 
     def state_sha256(self) -> str:
         """SHA-256 of the complete integration state."""

@@ -28,6 +28,7 @@ import numpy as np
 
 from lerobot_roborecover.scenario import Pose, Reset, Task
 from lerobot_roborecover.simulators.base import Observation, SimulatorError
+from lerobot_roborecover.simulators.metaworld_marks import handled_body, marks
 from lerobot_roborecover.simulators.mujoco_state import (
     hash_arrays,
     load_state,
@@ -92,6 +93,7 @@ class MetaworldSimulator:
         self._frame: np.ndarray | None = None
         self._tracked: dict[str, int] = {}
         self._parts: dict[str, set[int]] = {}
+        self._task_name, self._handled = "", None
         self._fingers: list[set[int]] = []
         spaces: dict[str, gym.Space[Any]] = {}
         if obs_type != "state":
@@ -129,6 +131,7 @@ class MetaworldSimulator:
         env.seeded_rand_vec = True
         env.seed(reset.seed)
         self._raw, _ = env.reset(seed=reset.seed)
+        self._task_name, self._handled = task.name, handled_body(env, self._parts, self._raw)
         env._last_stable_obs = None
         self._success = False
         self._frame = None
@@ -186,12 +189,13 @@ class MetaworldSimulator:
         return {name for name, parts in self._parts.items() if right & parts and left & parts}
 
     def bodies(self) -> dict[str, Pose]:
-        """`eef`: between the fingertips, turned as the hand. The rest by centre of mass: hinges show."""
+        """`eef`: between the fingertips, turned as the hand. The rest by centre of mass: hinges show. Beside
+        them the marks of `metaworld_marks`."""
         env = self._ready()
         poses = {"eef": Pose(tuple(env.tcp_center), _xyzw(env.data.body("hand").xquat))}
         for name, body in self._tracked.items():
             poses[name] = Pose(tuple(env.data.xipos[body]), _xyzw(env.data.xquat[body]))
-        return poses
+        return poses | marks(self._task_name, self._handled, self._raw)
 
     def state_sha256(self) -> str:
         """Hash of the integration state, of the fixtures' places, and of the observation stack."""
