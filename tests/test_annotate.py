@@ -19,15 +19,16 @@ from PIL import Image
 from lerobot_roborecover.build.annotate.discussion import Discussion
 from lerobot_roborecover.build.annotate.examples import Examples
 from lerobot_roborecover.build.annotate.frames import PACK, FrameStore, Videos
-from lerobot_roborecover.build.annotate.guard import MAX_BODY_BYTES
 from lerobot_roborecover.build.annotate.guide import CELLS, SLUGS
 from lerobot_roborecover.build.annotate.queue import queue_order
-from lerobot_roborecover.build.annotate.serve import AnnotateConfig, listen, serve
+from lerobot_roborecover.build.annotate.serve import AnnotateConfig, serve
 from lerobot_roborecover.build.annotate.server import Desk, Study, make_app
 from lerobot_roborecover.build.annotate.votes import Vote, VoteBook, ballot
 from lerobot_roborecover.build.candidates import read_candidates
 from lerobot_roborecover.build.journal import read_journal
 from lerobot_roborecover.build.resolution import queued
+from lerobot_roborecover.build.web.guard import MAX_BODY_BYTES
+from lerobot_roborecover.build.web.serve import listen
 from lerobot_roborecover.scenario import ScenarioError
 
 TOKENS = {"ann": "a" * 32, "bob": "b" * 32}

@@ -1,15 +1,7 @@
-"""Runs the annotation server: loopback only, one address with a token an annotator, until it is stopped.
-
-Tokens are kept for the next start, so that a page that was open before goes on where it was.
-"""
+"""Runs the annotation server: one address with a token an annotator, until it is stopped."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import secrets
-import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +13,9 @@ from lerobot_roborecover.build.annotate.queue import queue_order
 from lerobot_roborecover.build.annotate.votes import VoteBook, check_name, votes_folder
 from lerobot_roborecover.build.candidates import read_candidates
 from lerobot_roborecover.build.resolution import queued
+from lerobot_roborecover.build.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 from lerobot_roborecover.scenario import ScenarioError
 
-HOST = "127.0.0.1"
 DEFAULT_PORT = 8731
 
 
@@ -58,7 +50,7 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
         ScenarioError: something cannot be read, the port is taken, or an annotator is served elsewhere.
     """
     try:
-        import uvicorn
+        import uvicorn  # noqa: F401 - what is missing is said before anything is read
 
         from lerobot_roborecover.build.annotate.server import Desk, Study, make_app
     except ImportError as err:
@@ -85,71 +77,20 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
     books: list[VoteBook] = []
     examples = Examples(config.dataset, candidates.platform, render=config.examples)
     try:
-        tokens = _tokens(folder, names)
+        tokens = kept_tokens("annotate", folder, names)
         desks = {}
         for name in names:
             books.append(VoteBook(folder, name, discussion.round if discussion else 1))
             desks[name] = Desk(tokens[name], books[-1], queue_order(sorted(wanted), name, config.seed))
-        hosts = frozenset({f"{HOST}:{port}", f"localhost:{port}"})
-        app = make_app(Study(candidates, frames, examples, desks, hosts, discussion))
+        app = make_app(Study(candidates, frames, examples, desks, own_hosts(port), discussion))
         for name in names:
             done = len(set(desks[name].book.ballot().votes) & wanted)
             say(f"{name}: {done} of {len(wanted)} done  http://{HOST}:{port}/{name}/?token={tokens[name]}")
         say(f"votes are kept in {folder}; Ctrl-C stops, the same command goes on")
-        server = uvicorn.Server(
-            uvicorn.Config(
-                app, log_level="warning", access_log=False, server_header=False, timeout_graceful_shutdown=2
-            )
-        )
-        server.run(sockets=[listener])
+        make_server(app).run(sockets=[listener])
     finally:
         for book in books:
             book.close()
         frames.close()
         examples.close()
         listener.close()
-
-
-def listen(port: int) -> socket.socket:
-    """A socket on this machine alone.
-
-    Args:
-        port: 0 takes a free one.
-
-    Raises:
-        ScenarioError: the port is taken, or none.
-    """
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((HOST, port))
-        # Whoever comes before the server is ready waits, instead of being turned away.
-        listener.listen(128)
-    except (OSError, OverflowError) as err:
-        listener.close()
-        raise ScenarioError(
-            f"port {port} cannot be used: {err}. Name another: --port 0 takes a free one"
-        ) from None
-    return listener
-
-
-def _tokens(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Each annotator's token, made once for each folder of votes; kept outside the dataset, which may be
-    published."""
-    base = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "roborecover"
-    base.mkdir(parents=True, exist_ok=True)
-    path = base / f"annotate-{hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]}.json"
-    try:
-        known = {str(k): str(v) for k, v in json.loads(path.read_text("utf-8")).items()}
-    except (OSError, ValueError, AttributeError):
-        known = {}
-    for name in names:
-        if len(known.get(name, "")) < 20:
-            known[name] = secrets.token_urlsafe(24)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(
-        os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
-    ) as file:
-        json.dump(known, file)
-    os.replace(temporary, path)
-    return {name: known[name] for name in names}

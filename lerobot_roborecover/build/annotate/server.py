@@ -2,7 +2,7 @@
 
 Each annotator has a token and an address of their own, `/NAME/`. The first request carries the token in its
 query and gets it as a cookie for that address; every further request, pictures included, must carry the
-cookie (`guard.py`).
+cookie (`build/web/guard.py`).
 
 Starlette and uvicorn rather than `http.server`: header, cookie and body parsing are what a server gets wrong,
 and the same stack carries the live streams of `teleop`.
@@ -18,23 +18,17 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from lerobot_roborecover.build.annotate.discussion import Discussion
 from lerobot_roborecover.build.annotate.examples import Examples
 from lerobot_roborecover.build.annotate.frames import PACK, FrameStore
-from lerobot_roborecover.build.annotate.guard import (
-    Refusal,
-    check_request,
-    cookie_name,
-    guarded,
-    read_body,
-)
 from lerobot_roborecover.build.annotate.guide import as_json
 from lerobot_roborecover.build.annotate.traces import suggest, traces
 from lerobot_roborecover.build.annotate.votes import Vote, VoteBook, VoteError, parse_vote
 from lerobot_roborecover.build.candidates import CandidateSet
+from lerobot_roborecover.build.web.guard import Refusal, check_token, guarded, read_body, with_cookie
 from lerobot_roborecover.scenario import ScenarioError, Source
 
 MAX_BODIES_PLOTTED = 4
@@ -85,10 +79,13 @@ class Handlers:
         """The annotator that a request comes from, as far as it may be answered.
 
         Raises:
-            Refusal: see `guard.check_request`.
+            Refusal: see `guard.check_token`.
         """
-        desks = self.study.desks
-        return desks[check_request(request, {name: desk.token for name, desk in desks.items()})]
+        name = request.path_params["annotator"]
+        desk = self.study.desks.get(name)
+        check_token(request, name, desk and desk.token, "roborecover annotate")
+        assert desk is not None
+        return desk
 
     def episode(self, desk: Desk, name: object) -> int:
         """A candidate's episode.
@@ -103,17 +100,8 @@ class Handlers:
     async def page(self, request: Request) -> Response:
         """A file of the page; the token in an address is exchanged for a cookie."""
         self.desk(request)
-        name = request.path_params["annotator"]
         if "token" in request.query_params:
-            answer = RedirectResponse(f"/{name}/", 303)
-            answer.set_cookie(
-                cookie_name(name),
-                request.query_params["token"],
-                path=f"/{name}/",
-                httponly=True,
-                samesite="strict",
-            )
-            return answer
+            return with_cookie(request, request.path_params["annotator"])
         found = _PAGE.get(request.path_params.get("file", ""))
         if found is None:
             raise Refusal(404, "there is no such file")

@@ -1,19 +1,19 @@
-"""What a request must bring before it is answered: this server's host, an annotator's token, a small body.
+"""What a request must bring before it is answered: this server's host, a token, a small body.
 
 The Host header must name this machine, so that a web page elsewhere cannot reach the server through a name
-that it points here; a request that changes something must come from the page itself.
+that it points here; a request that changes something, and every websocket that a browser opens, must come
+from the page itself.
 """
 
 from __future__ import annotations
 
 import hmac
 import json
-from collections.abc import Mapping
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
+from starlette.responses import JSONResponse, RedirectResponse, Response
 
 MAX_BODY_BYTES = 2**14
 _HEADERS = {
@@ -35,41 +35,51 @@ class Refusal(Exception):
         self.status, self.message = status, message
 
 
-def check_request(request: Request, tokens: Mapping[str, str]) -> str:
-    """The annotator that a request comes from.
+def check_token(request: HTTPConnection, name: str, token: str | None, command: str) -> None:
+    """Refuses a request without the token, or from another page.
 
     Args:
-        request: its address names the annotator.
-        tokens: by annotator.
+        request: or a websocket that is not accepted yet.
+        name: whose token, and whose cookie.
+        token: the right one; None where nobody has that name.
+        command: has printed the address.
 
     Raises:
         Refusal: the token is missing or wrong, or a change does not come from the page itself.
     """
-    name = request.path_params["annotator"]
-    token = tokens.get(name)
     sent = (request.cookies.get(cookie_name(name), ""), request.query_params.get("token", ""))
     # A wrong name is answered like a wrong token: nobody learns here who else takes part.
     if token is None or not any(hmac.compare_digest(s.encode(), token.encode()) for s in sent):
-        raise Refusal(403, "open the address, with its token, that `roborecover annotate` has printed")
-    if request.method == "POST":
+        raise Refusal(403, f"open the address, with its token, that `{command}` has printed")
+    if request.scope["type"] == "websocket" or request.scope["method"] == "POST":
         origin = request.headers.get("origin")
         if origin is not None and origin != f"http://{request.headers.get('host')}":
             raise Refusal(403, "this request does not come from the page")
-        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            raise Refusal(415, "the body must be application/json")
-    return name
 
 
-def cookie_name(annotator: str) -> str:
-    """Name of the cookie that holds an annotator's token."""
-    return f"roborecover_{annotator}"
+def with_cookie(request: Request, name: str) -> Response:
+    """Exchanges the token in an address for a cookie of that address."""
+    answer = RedirectResponse(f"/{name}/", 303)
+    answer.set_cookie(
+        cookie_name(name),
+        request.query_params["token"],
+        path=f"/{name}/",
+        httponly=True,
+        samesite="strict",
+    )
+    return answer
+
+
+def cookie_name(name: str) -> str:
+    """Name of the cookie that holds a person's token."""
+    return f"roborecover_{name}"
 
 
 def guarded(app: Starlette, hosts: frozenset[str]) -> Any:
     """Checks the host of every request, and puts the security headers on every answer, errors included."""
 
     async def wrapped(scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await app(scope, receive, send)
             return
 
@@ -81,6 +91,9 @@ def guarded(app: Starlette, hosts: frozenset[str]) -> Any:
 
         sent = [v.decode("latin-1") for k, v in scope["headers"] if k == b"host"]
         if len(sent) != 1 or sent[0] not in hosts:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008, "reason": "another host"})
+                return
             said = JSONResponse(
                 {"error": f"this server is {min(hosts)}; the request names another host"}, 421
             )
@@ -94,9 +107,13 @@ def guarded(app: Starlette, hosts: frozenset[str]) -> Any:
 async def read_body(request: Request) -> dict[str, Any]:
     """The JSON object in a request's body.
 
+    A page elsewhere cannot send one without asking first: that needs this content type.
+
     Raises:
         Refusal: it is too large, or something else.
     """
+    if request.headers.get("content-type", "").partition(";")[0] != "application/json":
+        raise Refusal(415, "the body must be application/json")
     data = b""
     try:
         async for part in request.stream():
