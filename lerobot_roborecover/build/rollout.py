@@ -46,7 +46,9 @@ def perturb_translations(action: np.ndarray, rng: np.random.Generator) -> np.nda
     """Adds independent Uniform(-1, 1) to the three translations, in normalised action space (paper, eq.
     1)."""
     action = np.array(action, dtype=np.float64)
-    action[:3] += rng.uniform(-1.0, 1.0, 3)
+    noise = rng.uniform(-1.0, 1.0, 3)
+    translations = min(len(action), 3)  # two in a plane
+    action[:translations] += noise[:translations]
     return action
 
 

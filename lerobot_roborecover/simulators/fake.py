@@ -22,6 +22,7 @@ import numpy as np
 
 from lerobot_roborecover.scenario import Pose, Reset, ScenarioError, Task
 from lerobot_roborecover.simulators.base import Observation, SimulatorError
+from lerobot_roborecover.simulators.limits import Workspace
 
 FAULT_STEP = 20
 """Steps after the reset at which a task of suite `faults` breaks."""
@@ -175,6 +176,19 @@ class FakeSimulator:
             "eef": Pose((*self._state[:2].tolist(), 0.0), upright),
             "puck": Pose((*self._state[4:6].tolist(), 0.0), upright),
         }
+
+    def reachable(self, action: np.ndarray) -> bool:
+        """Whether the mass, once it had the velocity that is asked for, would stay inside the walls."""
+        target = self._state[:2] + 0.6 * np.clip(action, -1.0, 1.0) * _DT_S
+        return bool((np.abs(target) <= 1.0).all())
+
+    def joint_margin_rad(self) -> float:
+        """A point has no joints."""
+        return float("inf")
+
+    def workspace(self) -> Workspace:
+        """Between the walls."""
+        return Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.0)
 
     def state_sha256(self) -> str:
         """Hash of position, velocity and puck."""

@@ -16,6 +16,7 @@ from lerobot_roborecover.simulators.catalog import check_task
 from lerobot_roborecover.simulators.libero_assets import find_assets, physics_hash, quiet_import
 from lerobot_roborecover.simulators.libero_task import FirstReset, LiberoTask
 from lerobot_roborecover.simulators.libero_view import LiberoView, ObservableClock
+from lerobot_roborecover.simulators.limits import Workspace
 from lerobot_roborecover.simulators.memory import release_freed_memory
 
 CAMERA_NAMES = {"agentview_image": "image", "robot0_eye_in_hand_image": "image2"}
@@ -196,6 +197,22 @@ class LiberoSimulator:
         """World poses of the grip site (`eef`) and of everything that can move, the robot left out."""
         self._require_reset()
         return self._task.bodies()
+
+    def reachable(self, action: np.ndarray) -> bool:
+        """Whether inverse kinematics finds a posture within the joint limits for where the command would send
+        the hand, and the controller's position limits, if it has any, allow it; see `libero_reach`."""
+        self._require_reset()
+        return self._task.reaches(np.asarray(action, dtype=np.float64))
+
+    def joint_margin_rad(self) -> float:
+        """Of the arm's seven joints."""
+        self._require_reset()
+        return self._task.reach.margin_rad(self._task.data.qpos)
+
+    def workspace(self) -> Workspace:
+        """Over the table that the problem stands on, up to 1 m; see `LiberoTask.workspace`."""
+        self._require_reset()
+        return self._task.workspace()
 
     def state_sha256(self) -> str:
         """SHA-256 of all that the continuation depends on."""

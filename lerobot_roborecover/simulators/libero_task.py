@@ -23,6 +23,8 @@ from lerobot_roborecover.scenario import Pose
 from lerobot_roborecover.simulators.base import SimulatorError
 from lerobot_roborecover.simulators.libero_assets import package_root
 from lerobot_roborecover.simulators.libero_init_states import read_init_states
+from lerobot_roborecover.simulators.libero_reach import ArmReach
+from lerobot_roborecover.simulators.limits import Workspace
 from lerobot_roborecover.simulators.mujoco_state import (
     body_pose,
     hash_arrays,
@@ -37,6 +39,8 @@ from lerobot_roborecover.simulators.mujoco_state import (
 _ENDLESS = 2**31 - 1
 """Horizon given to robosuite, which otherwise ends an episode after 1,000 steps whatever its outcome."""
 _PLACEMENT_ATTEMPTS = 100
+_REACH_M = 0.855
+"""Of a Franka Emika Panda (its data sheet)."""
 _CONTROLLER_CACHE = (
     "goal_pos",
     "goal_ori",
@@ -206,6 +210,35 @@ class LiberoTask:
         poses = {"eef": site_pose(self.data, self.robot.eef_site_id)}
         return poses | {name: body_pose(self.data, body) for name, body in self.movable_bodies.items()}
 
+    @cached_property
+    def reach(self) -> ArmReach:
+        """Inverse kinematics of the arm."""
+        return ArmReach(self.model, np.array(self.robot._ref_joint_indexes), self.robot.eef_site_id)
+
+    def reaches(self, action: np.ndarray) -> bool:
+        """Whether the arm can go where a relative command would send it."""
+        controller = self.robot.controller
+        goal = site_pose(self.data, self.robot.eef_site_id).position_m + controller.scale_action(action[:6])[:3]
+        if controller.position_limits is not None:
+            low, high = controller.position_limits
+            if (goal < low).any() or (goal > high).any():
+                return False
+        return self.reach.reaches(self.data.qpos, goal)
+
+    def workspace(self) -> Workspace:
+        """The table's area (LIBERO's problems name its size `..._full_size` and its top `workspace_offset`),
+        from 5 cm below its top, which is where a bent finger may be, to 1 m above. On the floor, where there
+        is no table, what the Panda's 0.855 m reach from its base."""
+        x, y, z = self.env.workspace_offset
+        sizes = [v for k, v in vars(self.env).items() if k.endswith("table_full_size")]
+        if sizes and z > 0.1:
+            half = np.array(sizes[-1][:2]) / 2
+            low, high = (x, y) - half, (x, y) + half
+        else:
+            base = self.data.body(self.robot.robot_model.root_body).xpos[:2]
+            low, high = base - _REACH_M, base + _REACH_M
+        return Workspace((*map(float, low), z - 0.05), (*map(float, high), z + 1.0), float(z))
+
     def fixtures(self) -> dict[str, Pose]:
         """Poses of the fixtures that LIBERO draws at reset, as the model holds them."""
         poses = {}
@@ -287,7 +320,7 @@ class LiberoTask:
         finally:
             self.env.hard_reset = False
             del self.env._initialize_sim
-        for name in ("fixture_bodies", "movable_bodies"):  # of the model before
+        for name in ("fixture_bodies", "movable_bodies", "reach"):  # of the model before
             self.__dict__.pop(name, None)
         return FirstReset(self.fixtures(), self.data.qacc_warmstart.copy())
 

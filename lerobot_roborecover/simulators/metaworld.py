@@ -29,6 +29,7 @@ import numpy as np
 from lerobot_roborecover.scenario import Pose, Reset, Task
 from lerobot_roborecover.simulators.base import Observation, SimulatorError
 from lerobot_roborecover.simulators.metaworld_marks import handled_body, marks
+from lerobot_roborecover.simulators.limits import Workspace
 from lerobot_roborecover.simulators.mujoco_state import (
     hash_arrays,
     load_state,
@@ -42,6 +43,9 @@ OBS_TYPES = ("pixels", "pixels_agent_pos", "state")
 ENVIRONMENT_STATE_DIM = 39
 _KEPT_ENVS = 4
 """Compiled tasks kept per simulator; one takes 0.02 to 0.4 s to build."""
+
+_FINGERS_M = 0.05
+"""How far the fingertips hang below the hand."""
 
 _CORNER2_POSITION_M = (0.75, 0.075, 0.7)
 """Where LeRobot's MetaworldEnv moves the corner2 camera."""
@@ -234,6 +238,28 @@ class MetaworldSimulator:
         self._raw = arrays["raw"]
         self._success = bool(arrays["success"])
         self._frame = None
+
+    def reachable(self, action: np.ndarray) -> bool:
+        """Whether the hand's target stays between `mocap_low` and `mocap_high`, where
+        `SawyerXYZEnv.set_xyz_action` would stop it. That a command is clipped to [-1, 1] is the input's range
+        and no limit of reach."""
+        env = self._ready()
+        target = env.data.mocap_pos[0] + np.clip(action[:3], -1.0, 1.0) * env.action_scale
+        return bool((target >= env.mocap_low).all() and (target <= env.mocap_high).all())
+
+    def joint_margin_rad(self) -> float:
+        """Of the Sawyer's seven joints."""
+        env = self._ready()
+        joints = [env.model.joint(f"right_j{k}") for k in range(7)]
+        q = np.array([env.data.qpos[j.qposadr[0]] for j in joints])
+        low, high = np.array([j.range for j in joints]).T
+        return float(min((q - low).min(), (high - q).min()))
+
+    def workspace(self) -> Workspace:
+        """The box of the hand's targets, with the fingertips' 5 cm below; the table's top is at 0."""
+        env = self._ready()
+        low = env.mocap_low - np.array([0.0, 0.0, _FINGERS_M])
+        return Workspace(tuple(map(float, low)), tuple(map(float, env.mocap_high)), 0.0)
 
     def fixtures(self) -> Mapping[str, Pose]:
         """None: the seed decides everything."""
