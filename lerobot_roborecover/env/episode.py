@@ -27,6 +27,10 @@ class SlotConfig:
     """How actions after the handoff are read, for simulators that have more than one way."""
     environment: Mapping[str, str | None] = field(default_factory=dict)
     """Environment variables of a worker process, beside the caller's; None unsets one."""
+    server: str = "lerobot_roborecover.env.slot_server:SlotServer"
+    """`module:class` that answers the slot's commands, made with this configuration."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What a server other than the usual one wants to know; plain JSON values."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@ it."""
 
 from __future__ import annotations
 
+import importlib
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,12 @@ from lerobot_roborecover.env.recovery_env import RecoveryEnv
 from lerobot_roborecover.replay import SnapshotCache
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.simulators import make_simulator
+
+
+def make_server(config: SlotConfig) -> SlotServer:
+    """The server that a configuration names."""
+    module, _, name = config.server.partition(":")
+    return getattr(importlib.import_module(module), name)(config)
 
 
 class SlotServer:

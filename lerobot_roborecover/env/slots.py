@@ -55,14 +55,14 @@ class InlineSlot:
 
     def receive(self) -> Reply:
         """Runs the command."""
-        from lerobot_roborecover.env.slot_server import SlotServer
+        from lerobot_roborecover.env.slot_server import make_server
 
         assert self._pending is not None, "receive without send"
         command, argument = self._pending
         self._pending = None
         try:
             if self._server is None:
-                self._server = SlotServer(self._config)
+                self._server = make_server(self._config)
             return self._server.answer(command, argument)
         except Exception as err:
             traceback.print_exc()

@@ -33,9 +33,9 @@ def main(fd: int) -> None:
             break
         try:
             if command == "configure":  # has no reply; what goes wrong answers the commands that follow
-                from lerobot_roborecover.env.slot_server import SlotServer
+                from lerobot_roborecover.env.slot_server import make_server
 
-                server = SlotServer(argument)
+                server = make_server(argument)
                 continue
             reply = server.answer(command, argument) if server is not None else failure
         except Exception as err:
