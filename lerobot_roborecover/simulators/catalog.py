@@ -8,6 +8,7 @@ import importlib.util
 import json
 import math
 import re
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def metaworld_instruction(name: str) -> str:
     """
     descriptions = _metaworld_config()["TASK_DESCRIPTIONS"]
     if name not in descriptions:
-        raise ScenarioError(f"metaworld has no task {name!r}{_nearest(name, descriptions)}")
+        raise ScenarioError(f"metaworld has no task {name!r}{nearest(name, descriptions)}")
     return descriptions[name]
 
 
@@ -96,7 +97,7 @@ def check_task(task: Task) -> None:
     catalogues = {"libero": libero_tasks, "metaworld": metaworld_tasks}
     if task.platform == "robotwin" and task.name not in STEP_LIMITS:
         # The suite is one of the checkout's task configurations, which the simulator checks.
-        raise ScenarioError(f"robotwin has no task {task.name!r}{_nearest(task.name, STEP_LIMITS)}")
+        raise ScenarioError(f"robotwin has no task {task.name!r}{nearest(task.name, STEP_LIMITS)}")
     if task.platform not in catalogues:
         return
     suites = catalogues[task.platform]()
@@ -104,7 +105,7 @@ def check_task(task: Task) -> None:
         raise ScenarioError(f"{task.platform} has no suite {task.suite!r}; there are {', '.join(suites)}")
     if task.name not in suites[task.suite]:
         elsewhere = [s for s, names in suites.items() if task.name in names]
-        hint = f"; it is a task of {elsewhere[0]}" if elsewhere else _nearest(task.name, suites[task.suite])
+        hint = f"; it is a task of {elsewhere[0]}" if elsewhere else nearest(task.name, suites[task.suite])
         raise ScenarioError(f"{task.platform} suite {task.suite} has no task {task.name!r}{hint}")
 
 
@@ -120,6 +121,7 @@ def _metaworld_config() -> dict:
         raise SimulatorError(f"LeRobot has no {path}; install lerobot==0.6.1") from None
 
 
-def _nearest(name: str, names) -> str:
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The end of a message about a name that there is not: those that it may have meant."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.4)
     return f"; nearest: {', '.join(close)}" if close else f"; there are {', '.join(sorted(names))}"

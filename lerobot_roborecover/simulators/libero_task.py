@@ -218,7 +218,9 @@ class LiberoTask:
     def reaches(self, action: np.ndarray) -> bool:
         """Whether the arm can go where a relative command would send it."""
         controller = self.robot.controller
-        goal = site_pose(self.data, self.robot.eef_site_id).position_m + controller.scale_action(action[:6])[:3]
+        goal = (
+            site_pose(self.data, self.robot.eef_site_id).position_m + controller.scale_action(action[:6])[:3]
+        )
         if controller.position_limits is not None:
             low, high = controller.position_limits
             if (goal < low).any() or (goal > high).any():

@@ -28,8 +28,8 @@ import numpy as np
 
 from lerobot_roborecover.scenario import Pose, Reset, Task
 from lerobot_roborecover.simulators.base import Observation, SimulatorError
-from lerobot_roborecover.simulators.metaworld_marks import handled_body, marks
 from lerobot_roborecover.simulators.limits import Workspace
+from lerobot_roborecover.simulators.metaworld_marks import handled_body, marks
 from lerobot_roborecover.simulators.mujoco_state import (
     hash_arrays,
     load_state,
