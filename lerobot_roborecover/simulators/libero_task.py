@@ -235,7 +235,7 @@ class LiberoTask:
         sizes = [v for k, v in vars(self.env).items() if k.endswith("table_full_size")]
         if sizes and z > 0.1:
             half = np.array(sizes[-1][:2]) / 2
-            low, high = (x, y) - half, (x, y) + half
+            low, high = np.array([x, y]) - half, np.array([x, y]) + half
         else:
             base = self.data.body(self.robot.robot_model.root_body).xpos[:2]
             low, high = base - _REACH_M, base + _REACH_M
