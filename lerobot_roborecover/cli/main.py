@@ -28,8 +28,10 @@ COMMANDS = (
     "export-ema",
     "monitor-data",
     "eval-monitor",
+    "teleop",
     "annotate",
     "agree",
+    "screen",
     "split",
 )
 """Each is a module of this folder (dashes as underscores) with `HELP`, `add_arguments(parser)` and

@@ -1,0 +1,107 @@
+"""`roborecover screen`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = (
+    "Run screening policies from every scenario's recovery point and keep the scenarios of intermediate "
+    "difficulty."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add = parser.add_argument
+    add("dataset", help="scenario set: folder, Hub id or shipped name")
+    add(
+        "--policy", action="append", default=[], metavar="[NAME=]CHECKPOINT",
+        help="a screening policy, folder or Hub id; give it again for each (the paper has four)",
+    )  # fmt: skip
+    add("--out", required=True, type=Path, help="folder of the new dataset; new or empty")
+    add("--trials", type=int, default=5, help="of each policy on each scenario (%(default)s)")
+    add(
+        "--keep", nargs=2, default=["0.1", "0.9"], metavar=("FEWEST", "MOST"),
+        help="successes of all policies together that stay: two counts, or two shares of all trials (0.1 "
+        "0.9: 2 to 18 of 20)",
+    )  # fmt: skip
+    add(
+        "--max-invalid", type=int, default=0, metavar="N",
+        help="invalid trials that a scenario may have; they count as failures (%(default)s)",
+    )  # fmt: skip
+    add("--trials-folder", type=Path, metavar="DIR", help="trials, kept between runs (OUT.trials)")
+    add(
+        "--trials-from", action="append", default=[], type=Path, metavar="DIR",
+        help="a trials folder of another machine, to be taken over first; may be given again",
+    )  # fmt: skip
+    add("--shard", default="", metavar="K/N", help="run this part's trials only, and write no dataset")
+    add(
+        "--retry", default="", metavar="OUTCOMES",
+        help="run invalid trials of these outcomes again, e.g. policy_error,timeout",
+    )  # fmt: skip
+    add("--run-seed", type=int, default=1000, help="of the trials (%(default)s)")
+    add("--device", help="of the policies")
+    add("--slots", type=int, default=0, help="simulators at work at once (one per core)")
+    add("--max-batch", type=int, default=64, help="observations per inference, at most (%(default)s)")
+    add(
+        "--env", action="append", default=[], metavar="[NAME:]KEY=VALUE",
+        help="option of the recovery env type, for one policy where its name stands before it; may be given "
+        "again",
+    )  # fmt: skip
+    add(
+        "--policy-option", action="append", default=[], metavar="[NAME:]KEY=VALUE",
+        help="the same of the policy's config, e.g. act:n_action_steps=10",
+    )  # fmt: skip
+    add(
+        "--rename-map", action="append", default=[], metavar="[NAME:]JSON",
+        help="the env's observation keys to the policy's, as --rename_map of lerobot-eval",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Screens, and prints the tables and the funnel."""
+    from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
+    from lerobot_roborecover.build.screen_dataset import ScreenRequest, screen_dataset
+    from lerobot_roborecover.build.screening import ScreenRule, format_histogram, format_policies
+    from lerobot_roborecover.build.screening_runs import parse_policies
+
+    policies, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
+    rule = ScreenRule(args.trials, tuple(args.keep), args.max_invalid)
+    request = ScreenRequest(
+        dataset=args.dataset,
+        policies=policies,
+        out=args.out,
+        trials_folder=args.trials_folder,
+        rule=rule,
+        run_seed=args.run_seed,
+        env=env,
+        trials_from=args.trials_from,
+        shard=args.shard,
+        retry=[o for o in args.retry.split(",") if o],
+        device=args.device,
+        slots=args.slots,
+        max_batch=args.max_batch,
+    )
+    made = screen_dataset(request, _progress)
+    if args.shard:
+        print(f"part {args.shard}: trials in {request.trials}; join with --trials-from {request.trials}")
+        return 0
+    low, high = rule.check(len(policies))
+    kept = sum(s.decision.verdict == "kept" for s in made.found)
+    print(
+        f"{kept} of {len(made.found)} scenarios in {args.out}: {low} to {high} successes of "
+        f"{len(policies) * rule.trials} ({len(policies)} policies x {rule.trials} trials)\n"
+    )
+    print(format_policies(made.found), end="\n\n")
+    print(format_histogram(made.found, rule), end="\n\n")
+    print(format_funnel(funnel(read_decisions(args.out))))
+    print(f"\nroborecover validate {args.out} --trials-folder {request.trials} --out VALIDATED")
+    return 0
+
+
+def _progress(policy: str, done: int, total: int) -> None:
+    if done == total or done % 10 == 0:
+        text = f"\rtrials of {policy}: {done} of {total}"
+        print(text, end="\n" if done == total else "", file=sys.stderr, flush=True)
