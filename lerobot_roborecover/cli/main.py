@@ -29,6 +29,7 @@ COMMANDS = (
     "monitor-data",
     "eval-monitor",
     "teleop",
+    "collect",
     "annotate",
     "agree",
     "screen",

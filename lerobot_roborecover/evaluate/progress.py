@@ -103,6 +103,7 @@ class ProgressLine:
         stream: where to write.
         clock: seconds, for the time left.
         detailed: with the success rate's interval, and trials per minute.
+        unit: what is counted.
     """
 
     def __init__(
@@ -112,8 +113,9 @@ class ProgressLine:
         clock: Callable[[], float] = time.monotonic,
         *,
         detailed: bool = False,
+        unit: str = "trials",
     ):
-        self._label, self._clock, self._detailed = label, clock, detailed
+        self._label, self._clock, self._detailed, self._unit = label, clock, detailed, unit
         self._stream = stream or sys.stderr
         self._done_before: int | None = None
         self._paced_from: tuple[float, int] | None = None
@@ -141,7 +143,7 @@ class ProgressLine:
 
     def _text(self, tally: Tally, now: float) -> str:
         """The line: trials, running rate, time left."""
-        parts = [f"{self._label:<9} {tally.done:>3}/{tally.total} trials"]
+        parts = [f"{self._label:<9} {tally.done:>3}/{tally.total} {self._unit}"]
         if tally.rate is not None:
             wide = self._detailed and tally.half_width is not None
             interval = f" ± {100 * tally.half_width:.1f}" if wide else ""
@@ -155,7 +157,7 @@ class ProgressLine:
             trial_s = (now - since) / (tally.done - done_then)
             left_s = trial_s * (tally.total - tally.done)
             if self._detailed and trial_s:
-                parts.append(f"{60 / trial_s:.1f} trials/min")
+                parts.append(f"{60 / trial_s:.1f} {self._unit}/min")
             parts.append(f"about {_duration(left_s)} left")
         return "  ".join(parts)
 

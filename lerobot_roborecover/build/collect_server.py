@@ -1,0 +1,113 @@
+"""The slot server of a collection: records what a policy does, drives scripted experts, films by replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_roborecover.build.collect_experts import make_driver
+from lerobot_roborecover.build.collect_record import RecorderSettings, RecordingSimulator
+from lerobot_roborecover.build.collect_starts import stream
+from lerobot_roborecover.env.episode import EpisodeSpec, EpisodeStart, SlotConfig
+from lerobot_roborecover.env.slot_server import SlotServer
+from lerobot_roborecover.scenario import Outcome, Reset, Scenario, Task
+from lerobot_roborecover.simulators import Observation
+
+SERVER = f"{__name__}:CollectServer"
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Reply to `drive`: how a scripted rollout ended."""
+
+    outcome: Outcome
+    steps: int
+    """Actions after settling."""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class FilmJob:
+    """A rollout to be replayed and looked at."""
+
+    task: Task
+    reset: Reset
+    actions: np.ndarray
+    """(T, A) float64."""
+    bodies: tuple[str, ...]
+    poses: np.ndarray
+    """(bodies, T + 1, 7) as recorded, to compare with."""
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """Reply to `film`."""
+
+    observations: list[Observation]
+    """T raw observations, one before each action."""
+    error_m: float
+    """Largest distance of a body from where it was recorded, at any step."""
+
+
+class CollectServer(SlotServer):
+    """A slot that records; without settings it only films.
+
+    Args:
+        config: `settings` are those of `RecorderSettings`.
+    """
+
+    def __init__(self, config: SlotConfig):
+        super().__init__(config)
+        self._settings = RecorderSettings(**config.settings) if config.settings else None
+        self._recording: RecordingSimulator | None = None
+        if self._settings is not None:
+            self._recording = RecordingSimulator(self._simulator, self._settings)
+            self._simulator = self._recording
+
+    def answer(self, command: str, argument: object = None) -> object:
+        """`drive` and `film` beside the usual commands."""
+        if command == "drive":
+            return self._drive(argument)
+        if command == "film":
+            return self._film(argument)
+        return super().answer(command, argument)
+
+    def _reset(self, spec: EpisodeSpec) -> EpisodeStart:
+        if self._recording is not None:
+            self._recording.plan(spec.scenario)
+        return super()._reset(spec)
+
+    def _drive(self, scenario: Scenario) -> Driven:
+        assert self._recording is not None
+        assert self._settings is not None
+        simulator, task, reset = self._recording, scenario.task, scenario.reset
+        simulator.plan(scenario)
+        simulator.reset(task, reset)
+        for action in scenario.prefix:
+            simulator.step(action)
+        if simulator.succeeded():
+            return Driven(Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action")
+        rng = stream(self._settings.seed, "driver", task, reset, scenario.provenance["trial"])
+        act = make_driver(self._settings.expert, simulator.inner, task, rng)
+        for t in range(task.horizon):
+            action = np.asarray(act(t), dtype=np.float64)
+            if not np.isfinite(action).all():
+                return Driven(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+            simulator.step(action)
+            if simulator.over:
+                solved = simulator.succeeded()
+                return Driven(Outcome.SUCCESS if solved else Outcome.HORIZON, t + 1)
+        return Driven(Outcome.HORIZON, task.horizon)
+
+    def _film(self, job: FilmJob) -> Filmed:
+        simulator, seen, error = self._simulator, [], 0.0
+        simulator.reset(job.task, job.reset)
+        for t in range(len(job.actions) + 1):
+            now = simulator.bodies()
+            places = np.array([now[name].position_m for name in job.bodies])
+            error = max(error, float(np.linalg.norm(places - job.poses[:, t, :3], axis=1).max()))
+            if t < len(job.actions):
+                seen.append(simulator.observe())
+                simulator.step(job.actions[t])
+        return Filmed(seen, error)

@@ -1,0 +1,156 @@
+"""`roborecover collect`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+HELP = "Roll out a policy or a scripted driver from initial states, and keep its failures as candidates."
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's own arguments; `--policy.*` and `--env.*` are LeRobot's."""
+    parser = argparse.ArgumentParser(
+        prog="roborecover collect",
+        description=HELP,
+        epilog="--policy.path=CHECKPOINT and any --policy.OPTION=VALUE, --env.type=roborecover_libero and "
+        "any --env.OPTION=VALUE are those of roborecover eval. A rerun goes on where it was stopped.",
+    )
+    add = parser.add_argument
+    add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy")
+    add("--name", default="", help="recorded name of whoever drives (checkpoint, or expert)")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder of the candidate dataset")
+    add("--work", type=Path, metavar="DIR", help="folder of the rollouts, kept (OUT.work)")
+    add(
+        "--task", action="append", default=[], metavar="PATTERN",
+        help="suite, task, or suite/task, with * and ?; repeat it for several",
+    )  # fmt: skip
+    add("--seeds", default="", help="start from these seeds, e.g. 0-29,40")
+    add("--init-states", default="", help="start from these of LIBERO's init states, e.g. 0,3,5-9")
+    add("--draw", type=int, default=0, metavar="N", help="draw N starts of each task instead")
+    add("--seed", type=int, default=7, help="of every draw: starts, noise, perturbation (%(default)s)")
+    add("--reset-seed", type=int, default=7, help="of LIBERO's resets (%(default)s, the paper's)")
+    add("--trials", type=int, default=1, help="rollouts from each start (%(default)s)")
+    add("--perturb", action="store_true", help="add Uniform(-1, 1) to the translations of early actions")
+    add("--perturb-steps", type=int, default=150, metavar="N", help="how many steps (%(default)s)")
+    add(
+        "--scene-touched", type=float, default=0.0, metavar="MM",
+        help="with --perturb: keep only rollouts in which an object ends at least so far from its path "
+        "without disturbance, or tipped; runs each undisturbed, too",
+    )  # fmt: skip
+    add("--frames", default="256", metavar="none|SIZE", help="side of the pictures, pixels (%(default)s)")
+    add("--no-exclude", action="append", default=[], metavar="RULE", help="do not ask this exclusion rule")
+    add("--exclude-only", action="append", default=[], metavar="RULE", help="ask this exclusion rule alone")
+    add("--slots", type=int, default=0, help="simulators at once (one per core)")
+    add("--max-batch", type=int, default=1, help="slots that a policy is asked for at once (%(default)s)")
+    add("--device", help="of the policy")
+    add("--rename_map", type=json.loads, default={}, help="the env's observation keys to the policy's, JSON")
+    add("--part-size", type=int, default=20, help="candidates written at a time (%(default)s)")
+    add("--watchdog", type=float, default=600.0, metavar="S", help="longest a rollout may take (%(default)s)")
+    add("--retry-errors", action="store_true", help="roll out again what broke in an earlier run")
+    add("--description", default="", help="of the dataset")
+    add("--license", help="SPDX identifier of the dataset; none is assumed")
+    add("--dry-run", action="store_true", help="list the rollouts, and run none")
+    return parser
+
+
+def pass_through(argv: Sequence[str]) -> int:
+    """Parses, collects, and prints the table."""
+    _quiet()
+    from lerobot_roborecover.build.collect import collect, describe, plan
+
+    parser = build_parser()
+    args, rest = parser.parse_known_args(_pairs(argv))
+    options = _options(parser, args, rest)
+    if args.dry_run:
+        units = plan(options)
+        for unit in units:
+            print(f"{unit.id}  {unit.task.suite}/{unit.task.name}")
+        print(f"{len(units)} rollouts; dry run: nothing was run")
+        return 0
+    collected = collect(options, lambda line: print(line, file=sys.stderr))
+    print(describe(collected))
+    return 0 if collected.out is not None else 1
+
+
+def _pairs(argv: Sequence[str]) -> list[str]:
+    """`--policy.path X` and `--env.type X` as `--policy.path=X`."""
+    joined: list[str] = []
+    for word in argv:
+        bare = joined and joined[-1].startswith(("--policy.", "--env.")) and "=" not in joined[-1]
+        if bare and not word.startswith("--"):
+            joined[-1] = f"{joined[-1]}={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]):
+    from lerobot_roborecover.build.collect import CollectOptions
+    from lerobot_roborecover.build.collect_judge import Judging
+    from lerobot_roborecover.build.collect_starts import Starts, parse_numbers
+    from lerobot_roborecover.env.options import OptionError
+
+    policy, kind, env, policy_options = "", "", [], []
+    for word in rest:
+        name, _, value = word.partition("=")
+        if name == "--policy.path":
+            policy = value
+        elif name == "--env.type":
+            kind = value.removeprefix("roborecover_")
+        elif name.startswith("--policy."):
+            policy_options.append(word.removeprefix("--policy."))
+        elif name.startswith("--env."):
+            env.append(word.removeprefix("--env."))
+        else:
+            parser.error(f"unrecognized argument: {word}")
+    if kind not in ("libero", "metaworld", "robotwin", "fake"):
+        raise OptionError(
+            f"--env.type={kind or 'none'}: give roborecover_libero, roborecover_metaworld or "
+            "roborecover_robotwin"
+        )
+    if args.frames != "none" and not args.frames.isdigit():
+        raise OptionError(f"--frames={args.frames}: none, or a side in pixels")
+    if not isinstance(args.rename_map, dict):
+        raise OptionError(f"--rename_map={args.rename_map!r:.80}: a JSON object of observation keys")
+    seeds = parse_numbers(args.seeds, "--seeds") if args.seeds else ()
+    states = parse_numbers(args.init_states, "--init-states") if args.init_states else ()
+    return CollectOptions(
+        platform=kind,
+        out=args.out,
+        starts=Starts(seeds, states, args.draw, args.seed, args.trials, args.reset_seed),
+        tasks=tuple(args.task),
+        policy=policy,
+        expert=args.expert,
+        name=args.name,
+        work=args.work,
+        env=tuple(env),
+        policy_options=tuple(policy_options),
+        rename_map=args.rename_map,
+        device=args.device,
+        perturb=args.perturb,
+        perturbed_steps=args.perturb_steps,
+        judging=Judging(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
+        seed=args.seed,
+        frames=0 if args.frames == "none" else int(args.frames),
+        slots=args.slots,
+        max_batch=args.max_batch,
+        part_size=args.part_size,
+        watchdog_s=args.watchdog,
+        retry_errors=args.retry_errors,
+        description=args.description,
+        license=args.license,
+    )
+
+
+def _quiet() -> None:
+    """Bars and encoder messages of every episode would bury the progress line."""
+    os.environ.setdefault("TQDM_DISABLE", "1")
+    os.environ.setdefault("SVT_LOG", "1")
+    import datasets
+
+    datasets.disable_progress_bars()
