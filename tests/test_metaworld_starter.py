@@ -86,7 +86,7 @@ def test_a_recorded_proof_still_recovers(shipped):
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_the_policy_loads_as_lerobot_eval_loads_it_and_solves_a_clean_start():
-    from lerobot_roborecover.build.metaworld_experts import learned_policy, task_named
+    from lerobot_roborecover.build.metaworld_experts import LearnedPolicy, task_named
     from lerobot_roborecover.scenario import Reset
 
     steps = json.loads((POLICY / "policy_preprocessor.json").read_text())["steps"]
@@ -94,7 +94,7 @@ def test_the_policy_loads_as_lerobot_eval_loads_it_and_solves_a_clean_start():
     simulator = make_simulator("metaworld", obs_type="state")
     task = task_named("push-v3")
     simulator.reset(task, Reset(seed=0))
-    act = learned_policy(simulator, task, str(POLICY))
+    act = LearnedPolicy(simulator, task, str(POLICY))
     for t in range(150):
         simulator.step(act(t))
         if simulator.succeeded():

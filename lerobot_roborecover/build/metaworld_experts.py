@@ -119,33 +119,42 @@ def weak_grip_expert(simulator: MetaworldSimulator, task_name: str, rng: np.rand
     return act
 
 
-def learned_policy(simulator: MetaworldSimulator, task: Task, checkpoint: str) -> Driver:
-    """A LeRobot checkpoint that reads the low-dimensional state, run as `lerobot-eval` would run it.
+class LearnedPolicy:
+    """A LeRobot checkpoint that reads the low-dimensional state, run as `lerobot-eval` would: a driver.
 
     Args:
         simulator: made with `obs_type="state"`.
         task: whose instruction the policy gets.
         checkpoint: folder or Hub id.
     """
-    import torch
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.envs.utils import preprocess_observation
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    config.device = "cpu"
-    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
-    overrides = {"device_processor": {"device": "cpu"}}
-    before, after = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides)
-    policy.reset()
+    def __init__(self, simulator: MetaworldSimulator, task: Task, checkpoint: str):
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-    @torch.inference_mode()
-    def act(_t: int) -> np.ndarray:
-        batched = {key: value[None] for key, value in simulator.observe().items()}
-        observation = before({**preprocess_observation(batched), "task": [task.instruction]})
-        return after(policy.select_action(observation))[0].numpy().astype(np.float64)
+        config = PreTrainedConfig.from_pretrained(checkpoint)
+        config.device = "cpu"
+        self._policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+        overrides = {"device_processor": {"device": "cpu"}}
+        self._before, self._after = make_pre_post_processors(
+            config, checkpoint, preprocessor_overrides=overrides
+        )
+        self._simulator, self._task = simulator, task
+        self.reset()
 
-    return act
+    def reset(self) -> None:
+        """Forgets the episode."""
+        self._policy.reset()
+
+    def __call__(self, _t: int) -> np.ndarray:
+        """See `Driver`."""
+        import torch
+        from lerobot.envs.utils import preprocess_observation
+
+        batched = {key: value[None] for key, value in self._simulator.observe().items()}
+        with torch.inference_mode():
+            observation = self._before({**preprocess_observation(batched), "task": [self._task.instruction]})
+            return self._after(self._policy.select_action(observation))[0].numpy().astype(np.float64)
 
 
 def _clipped(policy: object, raw: np.ndarray) -> np.ndarray:

@@ -21,21 +21,24 @@ import numpy as np
 from lerobot_roborecover.build.metaworld_dataset import (
     DEMO_TASKS,
     FIRST_SEED,
+    Episode,
     create_dataset,
     demonstration,
+    record,
     save_episode,
 )
 from lerobot_roborecover.build.metaworld_experts import patient_expert, task_named
 from lerobot_roborecover.scenario import Reset
 from lerobot_roborecover.simulators.metaworld import MetaworldSimulator
 
-_STEPS_AFTER_SUCCESS = 5
 _MAX_STEPS = 220
 """Two attempts."""
 
 
-def recovery(simulator: MetaworldSimulator, row: dict[str, Any], prefix: np.ndarray, seed: int) -> Any:
-    """Observations (T, 39) and actions (T, 4) of a recovery, float64; None where it failed.
+def recovery(
+    simulator: MetaworldSimulator, row: dict[str, Any], prefix: np.ndarray, seed: int
+) -> Episode | None:
+    """A recovery; None where it failed.
 
     Args:
         simulator: with any `obs_type`.
@@ -47,16 +50,7 @@ def recovery(simulator: MetaworldSimulator, row: dict[str, Any], prefix: np.ndar
     for action in prefix:
         simulator.step(action)
     act = patient_expert(simulator, row["task"], np.random.default_rng(seed))
-    observations, actions, left = [], [], _STEPS_AFTER_SUCCESS
-    for t in range(_MAX_STEPS):
-        observations.append(simulator.low_dim())
-        actions.append(act(t))
-        simulator.step(actions[-1])
-        if simulator.succeeded():
-            left -= 1
-            if left == 0:
-                return np.array(observations), np.array(actions)
-    return None
+    return record(simulator, act, _MAX_STEPS)
 
 
 def recoveries(simulator: MetaworldSimulator, failures: Path) -> Iterator[tuple[str, Any]]:

@@ -24,9 +24,9 @@ from lerobot_roborecover.build.metaworld_dataset import DEMO_TASKS
 from lerobot_roborecover.build.metaworld_experts import (
     HORIZON,
     Driver,
+    LearnedPolicy,
     biased_expert,
     expert,
-    learned_policy,
     patient_expert,
     task_named,
     weak_grip_expert,
@@ -96,7 +96,7 @@ def collections(weak_policy: str | None, first_seed: int = 0, limits: Limits = S
     if weak_policy:
 
         def learned(simulator: MetaworldSimulator, name: str, _rng: np.random.Generator) -> Driver:
-            return learned_policy(simulator, task_named(name), weak_policy)
+            return LearnedPolicy(simulator, task_named(name), weak_policy)
 
         found.append(Collection(Source.NATURAL, WEAK_POLICY, learned, seeds(30)))
     return found
