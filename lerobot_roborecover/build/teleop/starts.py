@@ -1,0 +1,156 @@
+"""Where a person begins: the first state of a task, or some way into a candidate's rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.datasets.task_lookup import task_by_name
+from lerobot_roborecover.scenario import PLATFORM_ACTION_DIMS, Reset, ScenarioError, Task
+
+LIBERO_SEED = 7
+"""Seed of LIBERO's environment in the paper's release; init states differ by their index."""
+MAX_STARTS = 100_000
+
+
+@dataclass(frozen=True)
+class StartPoint:
+    """One start."""
+
+    task: Task
+    reset: Reset
+    prefix: np.ndarray
+    """(t, A) float64: actions executed before the person takes over; settling at least."""
+    source_record: str = ""
+    """The candidate whose rollout it continues; empty at a task's first state."""
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    """Provenance of a continued rollout."""
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        place = f"seed {self.reset.seed}"
+        if self.reset.init_state_index is not None:
+            place = f"init state {self.reset.init_state_index}"
+        more = f", {self.source_record} from step {len(self.prefix)}" if self.source_record else ""
+        return f"{self.task.suite} / {self.task.name}, {place}{more}"
+
+
+def numbers(text: str, option: str) -> list[int]:
+    """Numbers from a list like `0-9,12`.
+
+    Raises:
+        ScenarioError: it is no such list; names the option.
+    """
+    found: list[int] = []
+    try:
+        for part in text.split(","):
+            first, _, last = part.strip().partition("-")
+            found += range(int(first), int(last or first) + 1)
+            if len(found) > MAX_STARTS:
+                raise ScenarioError(f"{option} lists more than {MAX_STARTS} numbers")
+    except ValueError:
+        raise ScenarioError(f"{option} {text!r:.80} is not a list of numbers like 0-9,12") from None
+    if not found or min(found) < 0 or max(found) >= 2**32:
+        raise ScenarioError(f"{option} {text!r:.80} names no numbers from 0 to 2^32 - 1")
+    return list(dict.fromkeys(found))
+
+
+def first_state(
+    platform: str, name: str, suite: str = "", seed: int | None = None, init_state: int | None = None
+) -> StartPoint:
+    """A task's first state, after its settling.
+
+    Args:
+        platform: its simulator.
+        name: the platform's own task name.
+        suite: where several have a task of this name.
+        seed: by default 0, and on LIBERO the paper's 7.
+        init_state: LIBERO's; 0 by default.
+
+    Raises:
+        ScenarioError: there is no such task, or a number is out of range.
+    """
+    task = _task(platform, name, suite)
+    if platform == "libero":
+        from lerobot_roborecover.simulators.libero import NO_OP, SETTLE_STEPS
+
+        reset = Reset(LIBERO_SEED if seed is None else seed, init_state or 0, SETTLE_STEPS)
+        return StartPoint(task, reset, np.tile(NO_OP, (SETTLE_STEPS, 1)))
+    if init_state is not None:
+        raise ScenarioError(f"{platform} has no init states; its tasks are laid out by a seed")
+    return StartPoint(task, Reset(0 if seed is None else seed), np.zeros((0, _width(platform))))
+
+
+def first_states(
+    platform: str, names: Sequence[str], suite: str, seeds: str | None, init_states: str | None
+) -> list[StartPoint]:
+    """Every task from every seed, or on LIBERO from every init state.
+
+    Args:
+        platform: its simulator.
+        names: task names.
+        suite: where several have a task of this name.
+        seeds: a list like `0-9,12`, or None for the default.
+        init_states: likewise.
+
+    Raises:
+        ScenarioError: see `first_state` and `numbers`.
+    """
+    wanted_seeds: list[int | None] = list(numbers(seeds, "--seeds")) if seeds else [None]
+    wanted_states: list[int | None] = list(numbers(init_states, "--init-states")) if init_states else [None]
+    return [
+        first_state(platform, name, suite, seed, state)
+        for name in names
+        for seed in wanted_seeds
+        for state in wanted_states
+    ]
+
+
+def continued(dataset: Path, candidate: str, step: int) -> StartPoint:
+    """Some steps into a candidate's rollout.
+
+    Args:
+        dataset: a candidate dataset.
+        candidate: its id.
+        step: actions to replay before the person takes over.
+
+    Raises:
+        ScenarioError: there is no such candidate or step.
+    """
+    from lerobot_roborecover.build.candidates import read_candidates
+
+    found = read_candidates(dataset)
+    if candidate not in found.by_id:
+        raise ScenarioError(f"{dataset} has no candidate {candidate!r:.80}")
+    episode = found.by_id[candidate]
+    row, reset = found.row(episode), found.row(episode).reset_record()
+    if reset is None or not reset.settle_steps <= step <= row.steps:
+        first = reset.settle_steps if reset else 0
+        raise ScenarioError(f"candidate {candidate} has steps {first} to {row.steps}; got {step}")
+    return StartPoint(
+        row.task_record(),
+        reset,
+        found.actions(episode)[:step],
+        found.candidates[episode].source_record or candidate,
+        {"dataset": found.root.name, "candidate": candidate, "step": step, "driver": row.driver},
+    )
+
+
+def _width(platform: str) -> int:
+    return PLATFORM_ACTION_DIMS[platform][0]
+
+
+def _task(platform: str, name: str, suite: str) -> Task:
+    if platform == "fake":
+        from lerobot_roborecover.simulators.fake import FAKE_TASKS
+
+        group = suite or "toy"
+        if name not in FAKE_TASKS.get(group, {}):
+            raise ScenarioError(f"fake has no task {name!r:.80} in {group!r:.80}")
+        return Task("fake", group, name, FAKE_TASKS[group][name], 45)
+    return task_by_name(platform, name, suite=suite)

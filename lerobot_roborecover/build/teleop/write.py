@@ -1,0 +1,200 @@
+"""From saved recordings to the candidate dataset: replayed, checked, rendered in parts, joined.
+
+Each part holds a few recordings and is a candidate dataset of its own; a run that was stopped goes on with
+the parts that are missing. The dataset itself is put together anew from all parts and takes its place
+at once.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.build.annotate.votes import votes_folder
+from lerobot_roborecover.build.candidates import UNPERTURBED, Candidate, Steps, Suggestion
+from lerobot_roborecover.build.candidates_write import Recording, merge_candidates, write_candidates
+from lerobot_roborecover.build.funnel import DECISIONS_FILE, read_decisions
+from lerobot_roborecover.build.teleop.store import Recorded, Store, read_recording
+from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.trajectory_write import Trajectory
+from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, ScenarioError, Source
+from lerobot_roborecover.simulators import Simulator, make_simulator
+
+PER_PART = 10
+"""Recordings of a part: so many are rendered again, at most, after an interruption."""
+
+
+def recordings_folder(dataset: Path) -> Path:
+    """Where the recordings of a dataset lie: beside it, since a dataset is written as a whole."""
+    return dataset.with_name(f"{dataset.name}.recordings")
+
+
+def check_open(dataset: Path) -> None:
+    """Checks that recordings may still be added to a dataset.
+
+    Raises:
+        ScenarioError: it is something else, or work on it has begun.
+    """
+    if not dataset.exists() or not any(dataset.iterdir()):
+        return
+    if not recordings_folder(dataset).is_dir():
+        raise ScenarioError(f"{dataset} was not made by `roborecover teleop`; name a new folder")
+    later = {d.stage for d in read_decisions(dataset)} - {"collect"} if _has_decisions(dataset) else set()
+    votes = votes_folder(dataset, None)
+    if later or (votes.is_dir() and any(votes.iterdir())):
+        raise ScenarioError(
+            f"{dataset} is being worked on ({', '.join(sorted(later)) or 'annotated'}); recordings cannot be "
+            "added any more. Name a new folder; `merge_candidates` joins datasets"
+        )
+
+
+def _has_decisions(dataset: Path) -> bool:
+    return (dataset / FOLDER / DECISIONS_FILE).exists()
+
+
+def write_dataset(
+    dataset: Path,
+    store: Store,
+    platform: str,
+    options: Mapping[str, Any],
+    size: int | None,
+    say: Callable[[str], None],
+) -> bool:
+    """Renders the recordings that no part holds yet, and puts the dataset together.
+
+    Args:
+        dataset: its folder.
+        store: the recordings.
+        platform: their simulator.
+        options: of the simulator, beside its pictures.
+        size: rows and columns of the pictures; None for the platform's own.
+        say: told the progress.
+
+    Returns:
+        Whether there is anything.
+
+    Raises:
+        ScenarioError: a recording is damaged, or the dataset is being worked on.
+        SimulatorError: the simulator cannot be had, or cannot render.
+    """
+    from lerobot_roborecover.build.teleop.serve import view_options
+
+    check_open(dataset)
+    paths = store.paths()
+    if not paths:
+        say("nothing was recorded")
+        return False
+    groups = [paths[i : i + PER_PART] for i in range(0, len(paths), PER_PART)]
+    parts = [_part_of(store.folder, group) for group in groups]
+    missing = [(group, part) for group, part in zip(groups, parts, strict=True) if not part.is_dir()]
+    if not missing and dataset.exists():
+        say(f"{dataset} holds all {len(paths)} recordings")
+        return True
+    if missing:
+        simulator = make_simulator(platform, **{**options, **view_options(platform, size)})
+        try:
+            done = len(paths) - sum(len(group) for group, _ in missing)
+            for group, part in missing:
+                recordings = [read_recording(path) for path in group]
+                say(f"rendering {done + 1} to {done + len(group)} of {len(paths)}")
+                _write_part(part, recordings, simulator)
+                done += len(group)
+        finally:
+            simulator.close()
+    _join(dataset, parts)
+    for old in set(store.folder.glob("part-*")) - set(parts):
+        shutil.rmtree(old)
+    say(f"{dataset}: {len(paths)} candidates")
+    return True
+
+
+def _part_of(folder: Path, group: list[Path]) -> Path:
+    first, last = (path.stem.removeprefix("recording-") for path in (group[0], group[-1]))
+    return folder / f"part-{first}-{last}"
+
+
+def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator) -> None:
+    versions = simulator.fingerprint()
+    for recorded in recordings:
+        if dict(recorded.versions) != versions:
+            raise ScenarioError(
+                f"{recorded.id} was recorded with {dict(recorded.versions)}, and this is {versions}: what it "
+                "did would not happen again. Write the dataset with what recorded it"
+            )
+    write_candidates(
+        part,
+        (_as_candidate(recorded, simulator) for recorded in recordings),
+        fps=round(simulator.control_hz),
+        versions=versions,
+        description="Driven by hand with `roborecover teleop`.",
+    )
+
+
+def _as_candidate(recorded: Recorded, simulator: Simulator) -> Recording:
+    count, mark = len(recorded.actions), recorded.mark
+    error_m = _replay_error_m(recorded, simulator)
+    reason, detail = recorded.lacks, ""
+    if error_m > HANDOFF_TOLERANCE_M:
+        reason = "does not replay"
+        detail = f"{error_m * 1000:.3g} mm off; the limit is {HANDOFF_TOLERANCE_M * 1000:g}"
+    suggestions = ()
+    if mark is not None and mark[0] < count:
+        suggestions = (Suggestion(mark[0], "marked while driving", "operator", mark[1], mark[2]),)
+    proven = mark is not None and bool(recorded.solved[mark[0] + 1 :].any())
+    return Recording(
+        Candidate(recorded.id, Source.HUMAN, recorded.source_record, suggestions),
+        Trajectory(
+            task=recorded.task,
+            driver=recorded.operator,
+            actions=recorded.actions,
+            frames=_frames(recorded, simulator),
+            success=proven or bool(recorded.solved[-1]),
+            reset=recorded.reset,
+            provenance={"teleop": dict(recorded.notes)},
+        ),
+        Steps(recorded.bodies, recorded.solved, np.full(count, UNPERTURBED, np.int8)),
+        exclusion=reason,
+        exclusion_detail=detail,
+        excluded_by="teleop" if reason else "",
+    )
+
+
+def _replay_error_m(recorded: Recorded, simulator: Simulator) -> float:
+    """Largest displacement of any body at any step of a replay, metres."""
+    simulator.reset(recorded.task, recorded.reset)
+    largest = 0.0
+    for step in range(len(recorded.actions) + 1):
+        if step:
+            simulator.step(recorded.actions[step - 1])
+        for name, pose in simulator.bodies().items():
+            gap = np.linalg.norm(np.subtract(pose.position_m, recorded.bodies[name][step, :3]))
+            largest = max(largest, float(gap))
+    return largest
+
+
+def _frames(recorded: Recorded, simulator: Simulator) -> Iterator[Mapping[str, np.ndarray]]:
+    from lerobot_roborecover.datasets.episodes import to_frame
+
+    simulator.reset(recorded.task, recorded.reset)
+    for action in recorded.actions:
+        yield to_frame(recorded.task.platform, simulator.observe())
+        simulator.step(action)
+
+
+def _join(dataset: Path, parts: list[Path]) -> None:
+    fresh = dataset.with_name(f".{dataset.name}.{os.getpid()}.joined")
+    old = dataset.with_name(f".{dataset.name}.{os.getpid()}.old")
+    shutil.rmtree(fresh, ignore_errors=True)
+    try:
+        merge_candidates(fresh, parts)
+        if dataset.exists():
+            os.replace(dataset, old)
+        os.replace(fresh, dataset)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
