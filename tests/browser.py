@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-_FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+from lerobot_roborecover.build.auto_annotate.browser import FLAGS, SLOW_MS, find_chromium
 
 
 def chromium() -> str:
     """Path of the system's Chromium; skips the test where there is none."""
-    found = os.environ.get("ROBORECOVER_CHROMIUM") or next(filter(None, map(shutil.which, _NAMES)), None)
+    found = find_chromium()
     if not found:
         pytest.skip("no Chromium on this machine: apt-get install chromium, or set ROBORECOVER_CHROMIUM")
     return found
@@ -39,13 +33,12 @@ def browsing() -> Iterator:
     )
     program = chromium()
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=program, headless=True, args=list(_FLAGS))
+        browser = driver.chromium.launch(executable_path=program, headless=True, args=list(FLAGS))
 
         def visit(url: str) -> tuple:
             complaints: list[str] = []
             page = browser.new_context(viewport={"width": 1366, "height": 768}).new_page()
-            # A busy machine is no failure.
-            page.set_default_timeout(120_000)
+            page.set_default_timeout(SLOW_MS)
             host = url.split("/")[2]
             page.on(
                 "console", lambda m: complaints.append(m.text) if m.type in ("error", "warning") else None
@@ -90,7 +83,7 @@ def open_page(path: Path, profile: Path) -> Iterator[tuple]:
 
     with playwright.sync_playwright() as driver:
         context = driver.chromium.launch_persistent_context(
-            str(profile), executable_path=program, headless=True, args=list(_FLAGS), offline=True,
+            str(profile), executable_path=program, headless=True, args=list(FLAGS), offline=True,
             viewport={"width": 1200, "height": 900},
         )  # fmt: skip
         try:

@@ -13,8 +13,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, help="folder of a candidate dataset")
     add(
-        "--annotator", dest="annotators", action="append", required=True, metavar="NAME",
+        "--annotator", dest="annotators", action="append", default=[], metavar="NAME",
         help="who annotates; repeat it for several at once, each with an address of their own",
+    )  # fmt: skip
+    add(
+        "--automatic", action="store_true",
+        help="no people: three programs apply written rules to what the page shows; their labels are "
+        "marked as automatic wherever they go",
     )  # fmt: skip
     add("--port", type=int, default=8731, help="on this machine alone; 0 takes a free one (%(default)s)")
     add("--votes", type=Path, metavar="FOLDER", help="of all votes (DATASET/meta/roborecover/votes)")
@@ -32,20 +37,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serves the page until interrupted."""
+    """Serves the page until interrupted, or has programs annotate."""
     from lerobot_roborecover.build.annotate.serve import AnnotateConfig, serve
+    from lerobot_roborecover.build.auto_annotate.annotators import EYES, PREFIX, is_automatic
+    from lerobot_roborecover.build.auto_annotate.run import annotate
+    from lerobot_roborecover.scenario import ScenarioError
 
+    reserved = [name for name in args.annotators if is_automatic(name)]
+    if reserved:
+        raise ScenarioError(
+            f"--annotator {reserved[0]}: names that start with {PREFIX!r} are those of automatic annotators. "
+            "Take another, or --automatic"
+        )
+    if bool(args.annotators) == args.automatic:
+        raise ScenarioError("name who annotates with --annotator NAME, or say --automatic")
     config = AnnotateConfig(
         dataset=args.dataset,
-        annotators=args.annotators,
-        port=args.port,
+        annotators=tuple(EYES) if args.automatic else args.annotators,
+        port=0 if args.automatic else args.port,
         votes=args.votes,
         seed=args.seed,
         only=args.only,
-        examples=not args.no_examples,
+        examples=not (args.no_examples or args.automatic),
     )
+    work = annotate if args.automatic else serve
     try:
-        serve(config, lambda line: print(line, flush=True))
+        work(config, lambda line: print(line, flush=True))
     except KeyboardInterrupt:
         # The way to end it; every vote is on disk already.
         print("stopped")

@@ -25,7 +25,7 @@ from lerobot_roborecover.build.annotate.discussion import Discussion
 from lerobot_roborecover.build.annotate.examples import Examples
 from lerobot_roborecover.build.annotate.frames import PACK, FrameStore
 from lerobot_roborecover.build.annotate.guide import as_json
-from lerobot_roborecover.build.annotate.traces import suggest, traces
+from lerobot_roborecover.build.annotate.traces import Place, suggest, traces
 from lerobot_roborecover.build.annotate.votes import Vote, VoteBook, VoteError, parse_vote
 from lerobot_roborecover.build.candidates import CandidateSet
 from lerobot_roborecover.build.web.guard import Refusal, check_token, guarded, read_body, with_cookie
@@ -40,6 +40,7 @@ _PAGE = {
     "plots.js": ("plots.js", "text/javascript"),
     "outbox.js": ("outbox.js", "text/javascript"),
     "panel.js": ("panel.js", "text/javascript"),
+    "readout.js": ("readout.js", "text/javascript"),
     "guide.js": ("guide.js", "text/javascript"),
     "style.css": ("style.css", "text/css"),
 }
@@ -158,6 +159,7 @@ class Handlers:
             "gripper": {n: _rounded(v) for n, v in plotted.gripper.items()},
             "eef_speed": _rounded(plotted.eef_speed_m_s),
             "object_speed": {n: _rounded(v) for n, v in objects.items()},
+            "places": {n: _place_json(p) for n, p in plotted.places.items()},
             "vote": _vote_json(ballot.votes.get(name)),
             "suggestions": None,
             "discussion": None,
@@ -282,6 +284,11 @@ def _vote_json(vote: Vote | None) -> dict[str, Any] | None:
         return None
     shown = ("uid", "candidate", "verdict", "step", "stage", "deviation", "reason", "comment", "seconds")
     return {name: getattr(vote, name) for name in shown}
+
+
+def _place_json(place: Place) -> dict[str, list[float] | None]:
+    values = {"reach": place.reach_m, "goal": place.goal_m, "moved": place.moved_m, "height": place.height_m}
+    return {name: None if v is None else _rounded(v) for name, v in values.items()}
 
 
 def _rounded(values: Any) -> list[float]:

@@ -1,4 +1,4 @@
-"""What is plotted below the frames: actions, gripper, speeds of the end effector and of the objects."""
+"""What is plotted below the frames: actions, gripper, speeds, and where the objects are."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_roborecover.build.candidates import Steps, Suggestion
+from lerobot_roborecover.simulators.base import GOAL, HANDLE
 
 _GRIPPERS = {
     ("libero", 7): (6,),
@@ -24,6 +25,24 @@ STUCK_M, STUCK_S = 0.015, 1.0
 """The end effector is stuck where it stays within this distance for this long, to the end."""
 
 
+MAX_PLACES = 4
+"""Objects whose place is shown, at most."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where one object is, (T,) metres each."""
+
+    reach_m: np.ndarray
+    """From the nearest end effector."""
+    goal_m: np.ndarray | None
+    """From where the task wants it, where the recording says so."""
+    moved_m: np.ndarray
+    """From where it was when the rollout began."""
+    height_m: np.ndarray
+    """Above where it was then."""
+
+
 @dataclass(frozen=True)
 class Traces:
     """Plots of one rollout of T frames, one value a frame."""
@@ -36,6 +55,8 @@ class Traces:
     """(T,) of the fastest end effector."""
     object_speed_m_s: dict[str, np.ndarray]
     """(T,) by object, those that are ever moved, the one that moves farthest first; 0 while settling."""
+    places: dict[str, Place]
+    """By object: the one with a goal, then those that are moved, then whatever the hand came nearest to."""
 
 
 def traces(platform: str, actions: np.ndarray, steps: Steps, fps: float, settle_steps: int = 0) -> Traces:
@@ -51,18 +72,45 @@ def traces(platform: str, actions: np.ndarray, steps: Steps, fps: float, settle_
     """
     width = actions.shape[1]
     grippers = _GRIPPERS.get((platform, width), ())
-    speeds = {name: _speed(poses, fps) for name, poses in steps.bodies.items()}
-    eef = [s for name, s in speeds.items() if name.startswith("eef")]
+    eef = {n: poses[:, :3] for n, poses in steps.bodies.items() if n.startswith("eef")}
+    objects = positions(steps)
     later = np.arange(len(actions)) >= settle_steps
-    objects = {n: s * later for n, s in speeds.items() if not n.startswith("eef")}
-    objects = {n: s for n, s in objects.items() if s.max() > MOVING_M_S}
-    farthest = sorted(objects, key=lambda n: (-float(objects[n].sum()), n))
+    speeds = {n: _speed(points, fps) * later for n, points in objects.items()}
+    speeds = {n: s for n, s in speeds.items() if s.max() > MOVING_M_S}
+    farthest = sorted(speeds, key=lambda n: (-float(speeds[n].sum()), n))
     return Traces(
         {f"a{i}": actions[:, i] for i in range(width) if i not in grippers},
         {f"a{i}": actions[:, i] for i in grippers},
-        np.max(eef, axis=0),
-        {name: objects[name] for name in farthest},
+        np.max([_speed(points, fps) for points in eef.values()], axis=0),
+        {name: speeds[name] for name in farthest},
+        _places(steps, list(eef.values()), objects, farthest, settle_steps),
     )
+
+
+def positions(steps: Steps) -> dict[str, np.ndarray]:
+    """(T + 1, 3) metres of every object; where it has a handle (`Simulator.bodies`), that of its handle."""
+    marks = {n for n in steps.bodies if n == GOAL or n.endswith(HANDLE)}
+    objects = {n: p for n, p in steps.bodies.items() if n not in marks and not n.startswith("eef")}
+    return {n: steps.bodies.get(n + HANDLE, p)[:, :3] for n, p in objects.items()}
+
+
+def _places(
+    steps: Steps, hands: list[np.ndarray], objects: dict[str, np.ndarray], moved: list[str], start: int
+) -> dict[str, Place]:
+    found = {}
+    for name, points in objects.items():
+        handled = GOAL in steps.bodies and name + HANDLE in steps.bodies
+        goal = np.linalg.norm(points - steps.bodies[GOAL][:, :3], axis=1)[:-1] if handled else None
+        reach = np.min([np.linalg.norm(points - hand, axis=1) for hand in hands], axis=0)[:-1]
+        away = points - points[min(start, len(points) - 1)]
+        found[name] = Place(reach, goal, np.linalg.norm(away, axis=1)[:-1], away[:-1, 2])
+    rank = {name: i for i, name in enumerate(moved)}
+
+    def order(name: str) -> tuple:
+        place = found[name]
+        return place.goal_m is None, rank.get(name, len(rank)), float(place.reach_m.min()), name
+
+    return {name: found[name] for name in sorted(found, key=order)[:MAX_PLACES]}
 
 
 def suggest(steps: Steps, fps: float, first_step: int) -> list[Suggestion]:
@@ -77,10 +125,8 @@ def suggest(steps: Steps, fps: float, first_step: int) -> list[Suggestion]:
     """
     last = len(steps.perturbation) - 1
     found = []
-    for name, poses in steps.bodies.items():
-        if name.startswith("eef"):
-            continue
-        moving = np.flatnonzero(_speed(poses, fps) > MOVING_M_S)
+    for name, points in positions(steps).items():
+        moving = np.flatnonzero(_speed(points, fps) > MOVING_M_S)
         ends = [i for i, gap in zip(moving, np.diff(moving, append=10**9), strict=True) if gap > REST_S * fps]
         found += [Suggestion(int(i) + 1, f"{name} has come to rest", "rule") for i in ends]
     for name, poses in steps.bodies.items():
@@ -93,6 +139,6 @@ def suggest(steps: Steps, fps: float, first_step: int) -> list[Suggestion]:
     return sorted((s for s in found if first_step <= s.step <= last), key=lambda s: (s.step, s.reason))
 
 
-def _speed(poses: np.ndarray, fps: float) -> np.ndarray:
-    """(T,) metres a second over the action that follows each frame."""
-    return np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) * fps
+def _speed(points: np.ndarray, fps: float) -> np.ndarray:
+    """(T,) metres a second over the action that follows each frame, of (T + 1, 3) points."""
+    return np.linalg.norm(np.diff(points, axis=0), axis=1) * fps

@@ -6,11 +6,12 @@ import { element, fillGuide } from "./guide.js";
 import { Outbox, post } from "./outbox.js";
 import { fillDiscussion, fillSuggestions } from "./panel.js";
 import { Plots } from "./plots.js";
+import { Readout } from "./readout.js";
 
 const $ = (id) => document.getElementById(id);
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
-let session, outbox, drafts, plots;
+let session, outbox, drafts, plots, readout;
 let episode = null; // as the server describes it
 let draft = draftOf(null);
 let frames = null;
@@ -67,6 +68,7 @@ async function show(step) {
   shown = step;
   $("frame").textContent = `${step} / ${episode.steps - 1}`;
   $("time").textContent = `${(step / session.fps).toFixed(2)} s`;
+  readout.at(step);
   mark();
   document.dispatchEvent(new CustomEvent("frameshown", { detail: step }));
   own.look(step, direction);
@@ -255,6 +257,7 @@ async function open(id) {
   $("human").hidden = !info.human;
   $("temporary").disabled = info.human;
   plots.show(info);
+  readout.show(info, (name) => plots.colour(name));
   showDraft();
   fillSuggestions(info, show);
   fillDiscussion(info.discussion);
@@ -360,6 +363,7 @@ async function start() {
     return figure;
   }));
   plots = new Plots($("plots"), $("legend"), (step) => { pause(); show(step); });
+  readout = new Readout($("readout"));
   setSpeed(0);
   outbox = new Outbox(`${store()}/outbox`, (waiting, why) => {
     $("saved").className = why ? "waiting" : "";

@@ -1,4 +1,4 @@
-// Actions, gripper and speeds over time: drawn once an episode, with the cursor and the marks on top.
+// Actions, gripper, speeds and distances over time: drawn once an episode, with the cursor and the marks on top.
 
 const COLOURS = ["#58a6ff", "#f778ba", "#7ee787", "#ffa657", "#d2a8ff", "#79c0ff", "#ff7b72", "#e3b341"];
 const EEF = "#f4f7fa";
@@ -18,8 +18,7 @@ export class Plots {
   // episode: as the server describes it.
   show(episode) {
     this.episode = episode;
-    const objects = Object.keys(episode.object_speed);
-    const entries = [["end effector", EEF], ...objects.map((name, i) => [name, COLOURS[i % COLOURS.length]])];
+    const entries = [["end effector", EEF], ...this.#objects().map((name) => [name, this.colour(name)])];
     this.legend.replaceChildren(...entries.map(([name, colour]) => {
       const item = document.createElement("span");
       const line = item.appendChild(document.createElement("i"));
@@ -28,6 +27,14 @@ export class Plots {
       return item;
     }));
     this.#redraw();
+  }
+
+  colour(name) {
+    return COLOURS[this.#objects().indexOf(name) % COLOURS.length];
+  }
+
+  #objects() {
+    return [...new Set([...Object.keys(this.episode.object_speed), ...Object.keys(this.episode.places)])];
   }
 
   // marks: {step, point, suggestions: [step]}.
@@ -81,12 +88,19 @@ export class Plots {
     if (!episode || !width) return;
     const draw = base.getContext("2d");
     draw.scale(this.scale, this.scale);
-    const gripper = Object.values(episode.gripper);
+    const plain = (lists) => Object.values(lists).map((values, i) => ({ values, colour: COLOURS[i % COLOURS.length] }));
+    const gripper = plain(episode.gripper);
+    const own = (lists) => Object.entries(lists).map(([name, values]) => ({ values, colour: this.colour(name) }));
+    const part = (key, dash) => own(Object.fromEntries(
+      Object.entries(episode.places).filter(([, p]) => p[key]).map(([name, p]) => [name, p[key]]),
+    )).map((line) => ({ ...line, dash }));
     const rows = [
-      { name: "action", lines: Object.values(episode.actions), weight: 3 },
+      { name: "action", lines: plain(episode.actions), weight: 3 },
       ...(gripper.length ? [{ name: "gripper", lines: gripper, weight: 1.4 }] : []),
-      { name: "speed", unit: "m/s", lines: [...Object.values(episode.object_speed), episode.eef_speed], weight: 3, zero: true },
-    ];
+      { name: "speed", unit: "m/s", lines: [...own(episode.object_speed), { values: episode.eef_speed, colour: EEF }], weight: 3, zero: true },
+      // From the hand: whole lines. From the goal: dashed.
+      { name: "distance", unit: "m", lines: [...part("reach", []), ...part("goal", [5, 4])], weight: 3, zero: true },
+    ].filter((row) => row.lines.length);
     const total = rows.reduce((sum, row) => sum + row.weight, 0);
     let top = 4;
     for (const row of rows) {
@@ -98,7 +112,7 @@ export class Plots {
   }
 
   #row(draw, row, top, high) {
-    const values = row.lines.flat();
+    const values = row.lines.flatMap((line) => line.values);
     const low = row.zero ? 0 : Math.min(...values, 0);
     const range = Math.max(...values, row.zero ? 0.05 : 0) - low || 1;
     const y = (value) => top + high - ((value - low) / range) * high;
@@ -116,12 +130,14 @@ export class Plots {
       draw.lineTo(this.#x(this.episode.steps - 1), y(0));
       draw.stroke();
     }
-    row.lines.forEach((line, i) => {
-      draw.strokeStyle = row.zero && i === row.lines.length - 1 ? EEF : COLOURS[i % COLOURS.length];
-      draw.lineWidth = 1.6;
+    draw.lineWidth = 1.6;
+    for (const { values: line, colour, dash } of row.lines) {
+      draw.strokeStyle = colour;
+      draw.setLineDash(dash || []);
       draw.beginPath();
       line.forEach((value, step) => draw[step ? "lineTo" : "moveTo"](this.#x(step), y(value)));
       draw.stroke();
-    });
+    }
+    draw.setLineDash([]);
   }
 }
