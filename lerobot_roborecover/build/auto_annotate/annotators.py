@@ -1,0 +1,58 @@
+"""The three automatic annotators: the same rules, other thresholds, and other frames that they look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+PREFIX = "auto-"
+"""Of every automatic annotator's name, and of nobody else's."""
+
+
+@dataclass(frozen=True)
+class Eye:
+    """How one annotator looks and where it draws the line; metres and seconds."""
+
+    first_frame: int = 0
+    """Where it begins to look."""
+    tens: int = 1
+    """Presses of Shift and right arrow from one look to the next..."""
+    ones: int = 0
+    """... and presses of the right arrow alone after them."""
+    contact_m: float = 0.10
+    """The hand is at the object within this, and has to approach it beyond."""
+    place_m: float = 0.10
+    """The object is at its place within this."""
+    knocked_m: float = 0.04
+    """An object pushed sideways by more has changed the scene."""
+    carried_m: float = 0.02
+    """An object that went this far with the hand was in the grasp."""
+    lost_m: float = 0.05
+    """An object that was carried and is farther from the hand than this is lost."""
+    rest_m: float = 0.004
+    """An object that moves less than this within `rest_s` lies still."""
+    rest_s: float = 0.15
+    stuck_m: float = 0.015
+    """The hand is stuck where its distance to every object changes by less from `stuck_s` before to `stuck_s`
+    after."""
+    stuck_s: float = 0.25
+    event_m: float = 0.05
+    """An object that moves by more than this later was not final where it was."""
+    stable_s: float = 0.5
+    """How long a deviation has to last."""
+
+
+EYES: Mapping[str, Eye] = {
+    "auto-1": Eye(ones=5, tens=0),
+    "auto-2": Eye(contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018, event_m=0.04),
+    "auto-3": Eye(
+        first_frame=5, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
+        stuck_m=0.012, event_m=0.06, stable_s=0.4,
+    ),
+}  # fmt: skip
+"""By name."""
+
+
+def is_automatic(annotator: str) -> bool:
+    """Whether a name is an automatic annotator's."""
+    return annotator.startswith(PREFIX)

@@ -1,0 +1,66 @@
+"""What an automatic annotator has read off the page: numbers at the frames that it went to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+HAND = "hand"
+"""Row of the readout with the end effector's speed and the commanded gripper."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the page says about an episode as a whole."""
+
+    candidate: str
+    instruction: str
+    last: int
+    """Number of the last frame."""
+    fps: float
+    solved: bool
+    """At the last frame."""
+    human: bool
+    """A person caused the deviation and corrected it."""
+
+
+type Reading = Mapping[str, Mapping[str, float]]
+"""Numbers of one frame: by row (`HAND` or an object), by value (`speed`, `reach`, `goal`, ...)."""
+
+
+@dataclass
+class Look:
+    """An episode as far as it has been looked at."""
+
+    sheet: Sheet
+    readings: dict[int, Reading] = field(default_factory=dict)
+    """By frame."""
+
+    def frames(self) -> np.ndarray:
+        """(n,) frames looked at, in order."""
+        return np.array(sorted(self.readings), dtype=int)
+
+    def seconds(self) -> np.ndarray:
+        """(n,) their times."""
+        return self.frames() / self.sheet.fps
+
+    def objects(self) -> list[str]:
+        """Objects in the order of the page: the one with a goal comes first."""
+        first = self.readings[int(self.frames()[0])]
+        return [name for name in first if name != HAND]
+
+    def values(self, row: str, value: str) -> np.ndarray | None:
+        """(n,) numbers of one row, or None where the page has none."""
+        found = [self.readings[int(f)].get(row, {}).get(value) for f in self.frames()]
+        return None if any(v is None for v in found) else np.array(found, dtype=float)
+
+    def closed(self) -> np.ndarray:
+        """(n,) bool: the gripper is told to close; all True where it has no command of its own."""
+        first = self.readings[int(self.frames()[0])][HAND]
+        names = [name for name in first if name != "speed"]
+        commands = [self.values(HAND, name) for name in names]
+        if not commands:
+            return np.ones(len(self.readings), dtype=bool)
+        return np.any([c > 0 for c in commands if c is not None], axis=0)

@@ -1,0 +1,104 @@
+"""Runs automatic annotators: the real server, a browser, one annotator after the other, each at an address of
+its own. What has a vote already is left out, so that a run that was stopped goes on."""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+from lerobot_roborecover.build.annotate.serve import AnnotateConfig, serve
+from lerobot_roborecover.build.auto_annotate.annotators import EYES
+from lerobot_roborecover.build.auto_annotate.browser import SLOW_MS, browser
+from lerobot_roborecover.build.auto_annotate.page import Annotator
+from lerobot_roborecover.scenario import ScenarioError
+
+START_S = 120.0
+"""Longest that the server may take to start."""
+_SAY_EVERY = 20
+
+
+def annotate(config: AnnotateConfig, say: Callable[[str], None]) -> None:
+    """Has every candidate annotated by the automatic annotators that are named.
+
+    Args:
+        config: the session; annotators are names of `EYES`.
+        say: told the progress.
+
+    Raises:
+        ScenarioError: a name is none of them, or server, browser or page do not work.
+    """
+    unknown = [name for name in config.annotators if name not in EYES]
+    if unknown:
+        raise ScenarioError(
+            f"there is no automatic annotator {unknown[0]!r:.80}; there are {', '.join(EYES)}"
+        )
+    with _server(config) as addresses, browser() as made:
+        for name in config.annotators:
+            context = made.new_context(viewport={"width": 1366, "height": 900})
+            page = context.new_page()
+            page.set_default_timeout(SLOW_MS)
+            page.goto(addresses[name])
+            page.wait_for_selector("#cameras canvas[data-episode]")
+            _all(name, Annotator(page, EYES[name]), say)
+            context.close()
+
+
+def _all(name: str, annotator: Annotator, say: Callable[[str], None]) -> None:
+    total, after, began = annotator.left(), "", time.monotonic()
+    outcomes: Counter[str] = Counter()
+    for number in range(1, total + 1):
+        after, verdict = annotator.annotate(after)
+        outcomes[verdict.discard or f"{verdict.stage}-{verdict.deviation}"] += 1
+        if number % _SAY_EVERY == 0 or number == total:
+            each = (time.monotonic() - began) / number
+            say(f"{name}: {number} of {total}, {each:.2f} s an episode")
+    annotator.saved()
+    say(f"{name}: " + (", ".join(f"{n} {what}" for what, n in outcomes.most_common()) or "nothing to do"))
+
+
+@contextmanager
+def _server(config: AnnotateConfig) -> Iterator[dict[str, str]]:
+    """The annotation server as a process of its own; yields each annotator's address."""
+    context = multiprocessing.get_context("spawn")
+    mine, its = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(config, its), daemon=True)
+    process.start()
+    its.close()
+    try:
+        yield _addresses(mine, process, config.annotators)
+    finally:
+        process.terminate()
+        process.join(10)
+        if process.is_alive():
+            process.kill()
+
+
+def _addresses(lines: Connection, process: Any, names: Sequence[str]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    until = time.monotonic() + START_S
+    while len(found) < len(names):
+        if not lines.poll(max(until - time.monotonic(), 0.0)):
+            raise ScenarioError(f"the annotation server did not start within {START_S:g} s")
+        try:
+            kind, text = lines.recv()
+        except EOFError:
+            raise ScenarioError(f"the annotation server ended with status {process.exitcode}") from None
+        if kind == "error":
+            raise ScenarioError(text)
+        match = re.fullmatch(r"(\S+): .* (http://\S+)", text)
+        if match:
+            found[match[1]] = match[2]
+    return found
+
+
+def _serve(config: AnnotateConfig, said: Connection) -> None:
+    try:
+        serve(config, lambda line: said.send(("line", line)))
+    except ScenarioError as err:
+        said.send(("error", str(err)))
