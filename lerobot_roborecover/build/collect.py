@@ -76,6 +76,8 @@ class CollectOptions:
     judging: Judging = field(default_factory=Judging)
     seed: int = 7
     """Of the perturbation, of the policy's noise, and of drivers that draw."""
+    film_every: int = 1
+    """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
     """Side of the pictures in pixels; 0 films none."""
     slots: int = 0
@@ -109,6 +111,8 @@ class CollectOptions:
             if not low <= getattr(self, name) <= high:
                 option = name.removesuffix("_s").replace("_", "-")
                 raise OptionError(f"--{option}={getattr(self, name)}: must be from {low} to {high}")
+        if not 1 <= self.film_every <= 1000:
+            raise OptionError(f"--film-every={self.film_every}: 1 to 1000 steps")
         if self.frames and not 16 <= self.frames <= 2048:
             raise OptionError(f"--frames={self.frames}: none, or a side of 16 to 2048 pixels")
         if self.perturb and self.platform == "robotwin":
@@ -269,6 +273,7 @@ def _settings(
         "starts": {"tasks": list(options.tasks), **starts, "count": len(units)},
         "judging": judging,
         "frames": options.frames,
+        "film_every": options.film_every,
     }
     return rolled, json.loads(json.dumps(about))
 
@@ -465,7 +470,7 @@ def _write(
             raise ScenarioError(f"no simulator could be made to film with: {versions.message}")
         writing = Writing(
             book.records, work / "parts", pool, _slot_count(options), round(pool.spaces()["hz"]), versions,
-            f"{options.frames}", options.part_size, options.description, options.license,
+            f"{options.frames}/{options.film_every}", options.film_every, options.part_size, options.description, options.license,
         )  # fmt: skip
         count, line = _Count(0, len(kept)), ProgressLine("writing", detailed=True, unit="candidates")
 

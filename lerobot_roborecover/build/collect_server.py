@@ -38,6 +38,8 @@ class FilmJob:
     bodies: tuple[str, ...]
     poses: np.ndarray
     """(bodies, T + 1, 7) as recorded, to compare with."""
+    every: int = 1
+    """Looked at before each so many-th action; what was seen stands for those in between."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,6 @@ class CollectServer(SlotServer):
             places = np.array([now[name].position_m for name in job.bodies])
             error = max(error, float(np.linalg.norm(places - job.poses[:, t, :3], axis=1).max()))
             if t < len(job.actions):
-                seen.append(simulator.observe())
+                seen.append(simulator.observe() if t % job.every == 0 else seen[-1])
                 simulator.step(job.actions[t])
         return Filmed(seen, error)

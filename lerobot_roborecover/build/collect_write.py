@@ -52,6 +52,8 @@ class Writing:
     """Of the simulator."""
     frames: str
     """What is filmed; names the parts, so that another size is filmed anew."""
+    film_every: int = 1
+    """Steps from one picture to the next."""
     part_size: int = 20
     """Candidates of a part: what is lost, at most, when the writing is stopped."""
     description: str = ""
@@ -182,8 +184,9 @@ def _films(
         poses = record.steps.bodies
 
         return FilmJob(
-            v.scenario.task, record.reset, record.actions, tuple(poses), np.stack(list(poses.values()))
-        )
+            v.scenario.task, record.reset, record.actions, tuple(poses), np.stack(list(poses.values())),
+            writing.film_every,
+        )  # fmt: skip
 
     crew = writing.pool.slots(min(writing.slots, len(chunk)))
     for v, film in zip(chunk, in_order(crew, "film", chunk, job), strict=True):

@@ -43,6 +43,10 @@ def build_parser() -> argparse.ArgumentParser:
         "without disturbance, or tipped; runs each undisturbed, too",
     )  # fmt: skip
     add("--frames", default="256", metavar="none|SIZE", help="side of the pictures, pixels (%(default)s)")
+    add(
+        "--film-every", type=int, default=1, metavar="N",
+        help="render every Nth step alone, where that is slow; the picture stands until the next (%(default)s)",
+    )  # fmt: skip
     add("--no-exclude", action="append", default=[], metavar="RULE", help="do not ask this exclusion rule")
     add("--exclude-only", action="append", default=[], metavar="RULE", help="ask this exclusion rule alone")
     add("--slots", type=int, default=0, help="simulators at once (one per core)")
@@ -139,6 +143,7 @@ def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: li
         frames=0 if args.frames == "none" else int(args.frames),
         slots=args.slots,
         max_batch=args.max_batch,
+        film_every=args.film_every,
         part_size=args.part_size,
         watchdog_s=args.watchdog,
         retry_errors=args.retry_errors,

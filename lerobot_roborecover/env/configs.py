@@ -159,6 +159,9 @@ class RoboRecoverMetaworldEnv(_RecoveryEnvConfig, MetaworldEnv):
 
     observation_height: int = 480
     observation_width: int = 480
+    render_quality: str = "full"
+    """`full`, as LeRobot renders; or `fast`, without shadows and smoothing, some six times as fast where
+    there is no GPU. Other pictures, so another experiment for a policy that looks at them."""
     max_parallel_tasks: int = 1
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(4,))}
@@ -191,6 +194,7 @@ class RoboRecoverMetaworldEnv(_RecoveryEnvConfig, MetaworldEnv):
             "observation_height": self.observation_height,
             "observation_width": self.observation_width,
             "obs_type": self.obs_type,
+            **({} if self.render_quality == "full" else {"render_quality": self.render_quality}),
         }
 
     def run_spec(self) -> RunSpec:
@@ -200,6 +204,8 @@ class RoboRecoverMetaworldEnv(_RecoveryEnvConfig, MetaworldEnv):
             OptionError: an option cannot be used.
         """
         _refuse_unused(self, MetaworldEnv, ("task", "episode_length", "multitask_eval"))
+        if self.render_quality not in ("full", "fast"):
+            raise OptionError(f"--env.render_quality={self.render_quality}: not one of full, fast")
         _check_parallel(self)
         picture = _no_video if self.obs_type == "state" and not self.videos else None
         if self.obs_type != "state":

@@ -40,6 +40,7 @@ from lerobot_roborecover.simulators.mujoco_state import (
 )
 
 OBS_TYPES = ("pixels", "pixels_agent_pos", "state")
+RENDER_QUALITIES = ("full", "fast")
 ENVIRONMENT_STATE_DIM = 39
 _KEPT_ENVS = 4
 """Compiled tasks kept per simulator; one takes 0.02 to 0.4 s to build."""
@@ -70,6 +71,8 @@ class MetaworldSimulator:
         obs_type: `pixels`, `pixels_agent_pos` (both exactly LeRobot's), or `state`, which never renders:
             `agent_pos` (4,) float64 hand position in metres and gripper opening in [0, 1], and
             `environment_state` (39,) float64, Meta-World's own observation with the goal shown.
+        render_quality: `full` is LeRobot's; `fast` leaves out shadows and multisampling, which is where the
+            time goes on a machine without a GPU.
     """
 
     platform = "metaworld"
@@ -83,11 +86,16 @@ class MetaworldSimulator:
         observation_width: int = 480,
         camera_name: str = "corner2",
         obs_type: str = "pixels_agent_pos",
+        render_quality: str = "full",
     ):
+        if render_quality not in RENDER_QUALITIES:
+            raise SimulatorError(
+                f"render_quality {render_quality!r} is not one of {', '.join(RENDER_QUALITIES)}"
+            )
         if obs_type not in OBS_TYPES:
             raise SimulatorError(f"obs_type {obs_type!r} is not one of {', '.join(OBS_TYPES)}")
         self._height, self._width = observation_height, observation_width
-        self._camera, self._obs_type = camera_name, obs_type
+        self._camera, self._obs_type, self._fast = camera_name, obs_type, render_quality == "fast"
         self._envs: OrderedDict[str, Any] = OrderedDict()
         self._env: Any = None
         self._first_attributes: dict[str, dict[str, Any]] = {}
@@ -298,6 +306,8 @@ class MetaworldSimulator:
             raise SimulatorError(f"task {name} has no camera {self._camera!r}; it has {', '.join(cameras)}")
         if self._camera == "corner2":
             env.model.cam_pos[env.model.camera("corner2").id] = _CORNER2_POSITION_M
+        if self._fast:
+            env.model.vis.quality.shadowsize = env.model.vis.quality.offsamples = 0
         # In place of `set_task`, which stores a random vector that a seeded reset overwrites, and visibility.
         env._set_task_called = True
         env._partially_observable = False
