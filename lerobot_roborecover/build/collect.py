@@ -76,6 +76,8 @@ class CollectOptions:
     judging: Judging = field(default_factory=Judging)
     seed: int = 7
     """Of the perturbation, of the policy's noise, and of drivers that draw."""
+    horizon: int = 0
+    """Budget of each task in steps, of the rollouts and of the scenarios made from them; 0: the platform's."""
     film_every: int = 1
     """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
@@ -106,7 +108,7 @@ class CollectOptions:
             check_expert(self.platform, self.expert)
         for name, low, high in (
             ("perturbed_steps", 1, 100_000), ("seed", 0, 2**32 - 1), ("slots", 0, 1024),
-            ("max_batch", 1, 4096), ("part_size", 1, 10_000), ("watchdog_s", 1, 86_400),
+            ("horizon", 0, 10_000), ("max_batch", 1, 4096), ("part_size", 1, 10_000), ("watchdog_s", 1, 86_400),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 option = name.removesuffix("_s").replace("_", "-")
@@ -228,6 +230,8 @@ def _env(options: CollectOptions) -> tuple[Any, RunSpec]:
 
 def _units(options: CollectOptions, robotwin_root: str | None) -> list[Scenario]:
     tasks = choose_tasks(all_tasks(options.platform, robotwin_root), options.tasks)
+    if options.horizon:
+        tasks = [replace(task, horizon=options.horizon) for task in tasks]
     return make_units(
         tasks, options.starts, _driver(options), settle_action(options.platform), perturbed=options.perturb
     )
@@ -263,6 +267,7 @@ def _settings(
         "max batch": options.max_batch if options.policy else 1,
         "perturb": options.perturb,
         "perturbed steps": options.perturbed_steps if options.perturb else 0,
+        "horizon": options.horizon,
         "reset seed": options.starts.reset_seed if options.platform == "libero" else None,
     }
     judging = asdict(options.judging)
@@ -470,7 +475,8 @@ def _write(
             raise ScenarioError(f"no simulator could be made to film with: {versions.message}")
         writing = Writing(
             book.records, work / "parts", pool, _slot_count(options), round(pool.spaces()["hz"]), versions,
-            f"{options.frames}/{options.film_every}", options.film_every, options.part_size, options.description, options.license,
+            f"{options.frames}/{options.film_every}", options.film_every, options.part_size,
+            options.description, options.license,
         )  # fmt: skip
         count, line = _Count(0, len(kept)), ProgressLine("writing", detailed=True, unit="candidates")
 

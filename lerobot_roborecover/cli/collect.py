@@ -35,6 +35,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=7, help="of every draw: starts, noise, perturbation (%(default)s)")
     add("--reset-seed", type=int, default=7, help="of LIBERO's resets (%(default)s, the paper's)")
     add("--trials", type=int, default=1, help="rollouts from each start (%(default)s)")
+    add(
+        "--horizon", type=int, default=0, metavar="STEPS",
+        help="budget of each task, of the rollouts and of what is built from them (the platform's)",
+    )  # fmt: skip
     add("--perturb", action="store_true", help="add Uniform(-1, 1) to the translations of early actions")
     add("--perturb-steps", type=int, default=150, metavar="N", help="how many steps (%(default)s)")
     add(
@@ -45,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--frames", default="256", metavar="none|SIZE", help="side of the pictures, pixels (%(default)s)")
     add(
         "--film-every", type=int, default=1, metavar="N",
-        help="render every Nth step alone, where that is slow; the picture stands until the next (%(default)s)",
+        help="render every Nth step alone, where that is slow; it stands until the next (%(default)s)",
     )  # fmt: skip
     add("--no-exclude", action="append", default=[], metavar="RULE", help="do not ask this exclusion rule")
     add("--exclude-only", action="append", default=[], metavar="RULE", help="ask this exclusion rule alone")
@@ -143,6 +147,7 @@ def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: li
         frames=0 if args.frames == "none" else int(args.frames),
         slots=args.slots,
         max_batch=args.max_batch,
+        horizon=args.horizon,
         film_every=args.film_every,
         part_size=args.part_size,
         watchdog_s=args.watchdog,
