@@ -120,8 +120,8 @@ class CollectOptions:
         if self.perturb and self.platform == "robotwin":
             raise OptionError(
                 "--perturb: RoboTwin's actions are joint targets, or absolute poses that a planner turns "
-                "into joint motion; they have no normalised translations to perturb (the paper perturbs LIBERO "
-                "alone). Collect without it"
+                "into joint motion; they have no normalised translations to perturb (the paper perturbs "
+                "LIBERO alone). Collect without it"
             )
         if self.judging.scene_touched_mm and not self.perturb:
             raise OptionError("--scene-touched: what a disturbance touched can be asked with --perturb alone")

@@ -34,13 +34,14 @@ FALLEN_M = 0.05
 LIMIT_RAD = 0.01
 """Distance from a joint's limit that counts as at it."""
 LIMIT_STEPS = 60
-"""Last steps of a rollout, at least, that a joint is at its limit all the while."""
-PRESSING_STEPS = 150
-"""Last steps of a rollout, at least, in which the end effector is told to move and does not."""
+"""Last steps of a rollout, at least, in which a joint is at its limit and the end effector stays."""
+PRESSING_SHARE = 0.8
+"""Last part of a rollout, at least, in which the end effector is told to move and stays. That a policy ends
+stuck is an ordinary failure, with a recovery point before it; in so much of a rollout there is nothing else."""
 PRESSING_COMMAND = 0.5
 """Translation of a command, (-1 to 1), that asks for motion."""
-PRESSING_M = 0.02
-"""How far the end effector is from where it ends, at most, in all of those steps."""
+STAYS_M = 0.02
+"""How far the end effector is from where it ends, at most, when it stays."""
 REST_M = 0.001
 """How far an object at rest moves in the last `REST_STEPS`."""
 REST_STEPS = 20
@@ -104,6 +105,12 @@ def _hands(record: Record) -> dict[str, np.ndarray]:
     return {n: p[settle:, :3] for n, p in record.steps.bodies.items() if n.startswith("eef")}
 
 
+def _stays(record: Record) -> np.ndarray:
+    """(T' + 1,) bool: whether every end effector is where it ends."""
+    off = [np.linalg.norm(path - path[-1], axis=1) for path in _hands(record).values()]
+    return np.max(off, axis=0) <= STAYS_M
+
+
 def _erratic(record: Record) -> str:
     quiet = record.steps.perturbation[record.reset.settle_steps :] != PERTURBED
     for name, path in _hands(record).items():
@@ -154,11 +161,12 @@ def _fallen(record: Record) -> str:
 
 def _at_limit(record: Record) -> str:
     margin = record.margin_rad[record.reset.settle_steps :]
-    steps = _trailing(margin < LIMIT_RAD)
+    steps = _trailing((margin < LIMIT_RAD) & _stays(record))
     if steps >= LIMIT_STEPS:
         return (
             f"a joint is within {LIMIT_RAD:g} rad of its limit (smallest distance "
-            f"{float(margin[-steps:].min()):.3f} rad) in the last {steps} steps (limit {LIMIT_STEPS})"
+            f"{float(margin[-steps:].min()):.3f} rad), and the end effector stays, in the last {steps} steps "
+            f"(limit {LIMIT_STEPS})"
         )
     return ""
 
@@ -167,14 +175,12 @@ def _pressing(record: Record) -> str:
     settle = record.reset.settle_steps
     if len(_hands(record)) != 1:  # two arms' joint targets do not ask for a direction
         return ""
-    (path,) = _hands(record).values()
     asked = np.linalg.norm(np.clip(record.actions[settle:, :3], -1, 1), axis=1) >= PRESSING_COMMAND
-    still = np.linalg.norm(path[1:] - path[-1], axis=1) <= PRESSING_M
-    steps = _trailing(asked & still)
-    if steps >= PRESSING_STEPS:
+    steps = _trailing(asked & _stays(record)[1:])
+    if steps >= PRESSING_SHARE * len(asked):
         return (
             f"the end effector is told to move (at least {PRESSING_COMMAND:g}) and stays within "
-            f"{1e3 * PRESSING_M:.0f} mm in the last {steps} steps (limit {PRESSING_STEPS})"
+            f"{1e3 * STAYS_M:.0f} mm in the last {steps} of {len(asked)} steps (limit {PRESSING_SHARE:.0%})"
         )
     return ""
 

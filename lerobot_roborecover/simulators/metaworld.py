@@ -256,12 +256,9 @@ class MetaworldSimulator:
         return bool((target >= env.mocap_low).all() and (target <= env.mocap_high).all())
 
     def joint_margin_rad(self) -> float:
-        """Of the Sawyer's seven joints."""
-        env = self._ready()
-        joints = [env.model.joint(f"right_j{k}") for k in range(7)]
-        q = np.array([env.data.qpos[j.qposadr[0]] for j in joints])
-        low, high = np.array([j.range for j in joints]).T
-        return float(min((q - low).min(), (high - q).min()))
+        """Infinite: the hand is pulled by a mocap body, the arm hangs on it and rests at a joint's limit for
+        most of an ordinary success."""
+        return float("inf")
 
     def workspace(self) -> Workspace:
         """The box of the hand's targets, with the fingertips' 5 cm below; the table's top is at 0."""
