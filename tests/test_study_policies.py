@@ -1,0 +1,157 @@
+"""The recipe of the study's policies, and the checkpoints that came out of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = Path(str(files("lerobot_roborecover"))) / "data" / "metaworld_study" / "policies"
+NAMES = ("act", "act_clean", "act_few", "diffusion", "diffusion_few", "tdmpc")
+
+pytestmark = [pytest.mark.metaworld, pytest.mark.lerobot]
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory) -> Path:
+    """Three short episodes of made-up numbers."""
+    from lerobot_roborecover.build.metaworld_dataset import Episode, create_dataset, save_episode
+    from lerobot_roborecover.build.metaworld_experts import task_named
+
+    root = tmp_path_factory.mktemp("study") / "demonstrations"
+    dataset, rng = create_dataset(root), np.random.default_rng(0)
+    for steps in (9, 21, 14):
+        episode = Episode(rng.normal(size=(steps, 39)), rng.uniform(-1, 1, (steps, 4)), np.arange(steps) > 5)
+        save_episode(dataset, task_named("push-v3" if steps % 2 else "hammer-v3"), episode)
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.parametrize("episodes", [None, [0, 2]])
+def test_frames_from_memory_are_the_dataset_s(demonstrations, episodes, monkeypatch):
+    import torch
+    from lerobot.datasets.dataset_reader import DatasetReader
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_roborecover.build.frames_in_memory import frames_in_memory
+
+    deltas = {"action": [i / 80 for i in range(12)], "observation.state": [-1 / 80, 0.0]}
+    dataset = LeRobotDataset("a/b", root=demonstrations, episodes=episodes, delta_timestamps=deltas)
+    read = [dataset[i] for i in range(len(dataset))]
+    monkeypatch.setattr(DatasetReader, "_query_hf_dataset", None)  # nothing is read any more
+    with frames_in_memory():
+        kept = [dataset[i] for i in range(len(dataset))]
+    for one, other in zip(read, kept, strict=True):
+        assert one.keys() == other.keys()
+        for key, value in one.items():
+            if isinstance(value, str):
+                assert value == other[key]
+            else:
+                assert value.dtype == other[key].dtype
+                assert torch.equal(value, other[key]), key
+
+
+@pytest.mark.parametrize("name", ["diffusion_few", "tdmpc"])
+def test_training_from_memory_is_training(name, demonstrations, tmp_path, monkeypatch):
+    """The study's configs run in `lerobot-train`, and give the same weights either way."""
+    from lerobot.scripts.lerobot_train import main as lerobot_train
+    from safetensors.numpy import load_file
+
+    from lerobot_roborecover.build.frames_in_memory import main as from_memory
+
+    weights = []
+    for index, run in enumerate((lerobot_train, from_memory)):
+        out = tmp_path / str(index)
+        arguments = [f"--config_path={ROOT / 'policies/train/study' / name}.yaml", f"--output_dir={out}"]
+        sizes = ["--steps=2", "--save_freq=2", "--batch_size=4", f"--dataset.root={demonstrations}"]
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments, *sizes])
+        run()
+        weights.append(load_file(out / "checkpoints/last/pretrained_model/model.safetensors"))
+    for key, value in weights[0].items():
+        np.testing.assert_array_equal(value, weights[1][key], err_msg=key)
+
+
+def test_every_config_is_a_policy_s():
+    import draccus
+    from lerobot.configs.train import TrainPipelineConfig
+
+    import lerobot_roborecover.plugin  # noqa: F401
+    from lerobot_roborecover.build.study_policies import POLICIES
+
+    found = {}
+    for file in sorted((ROOT / "policies" / "train" / "study").glob("*.yaml")):
+        config = draccus.parse(TrainPipelineConfig, file, args=[])
+        assert config.scheduler.num_decay_steps == config.steps, file.name
+        found[file.stem] = config.policy.type
+    assert sorted(found) == sorted(POLICIES) == list(NAMES)
+    assert set(found.values()) == {"act", "diffusion", "tdmpc"}
+
+
+def test_each_policy_learns_from_its_share_of_every_task():
+    from lerobot_roborecover.build.metaworld_dataset import STUDY_TASKS
+    from lerobot_roborecover.build.study_policies import EPISODES_PER_TASK, episodes
+
+    assert len(set(STUDY_TASKS)) >= 15
+    assert episodes("act") is None
+    by_task = np.reshape(episodes("act_clean"), (len(STUDY_TASKS), -1))
+    assert by_task.shape[1] == EPISODES_PER_TASK // 2
+    assert (by_task // EPISODES_PER_TASK == np.arange(len(STUDY_TASKS))[:, None]).all()
+    assert (by_task % EPISODES_PER_TASK % 2 == 0).all(), "odd ones are shaken"
+    few = np.reshape(episodes("act_few"), (len(STUDY_TASKS), -1)) % EPISODES_PER_TASK
+    assert (few == np.arange(12)).all()
+
+
+def test_an_interrupted_training_goes_on(tmp_path):
+    from lerobot_roborecover.build.study_policies import training_arguments
+
+    fresh = training_arguments("act", tmp_path)
+    assert fresh[0] == f"--config_path={Path('policies/train/study/act.yaml')}"
+    started = tmp_path / "train" / "act"
+    started.mkdir(parents=True)
+    assert training_arguments("act", tmp_path) == fresh
+    assert not started.exists(), "LeRobot refuses a folder that is there"
+    last = started / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    last.parent.mkdir(parents=True)
+    last.write_text("{}")
+    assert training_arguments("act", tmp_path) == [f"--config_path={last}", "--resume=true"]
+
+
+def test_the_table_adds_up():
+    from lerobot_roborecover.build.initial_success import Tried, table
+
+    lines = table(
+        {
+            "a": {"push-v3": Tried(3, 4, 100, 0.2), "hammer-v3": Tried(1, 4, 300, 0.2)},
+            "b": {"push-v3": Tried(4, 4, 50, 0.1), "hammer-v3": Tried(4, 4, 50, 0.1)},
+        }
+    ).splitlines()
+    assert lines[2:] == [
+        "| push | 3/4 | 4/4 |", "| hammer | 1/4 | 4/4 |",
+        "| all | 50 % | 100 % |", "| ms an action | 1.0 | 2.0 |",
+    ]  # fmt: skip
+
+
+def test_the_shipped_policies_are_small_and_say_what_they_need():
+    assert sorted(path.name for path in SHIPPED.iterdir()) == list(NAMES)
+    for name in NAMES:
+        folder = SHIPPED / name
+        assert (folder / "model.safetensors").stat().st_size <= 2.5e6, name
+        assert not (folder / "train_config.json").exists(), "it names the machine it was trained on"
+        config = json.loads((folder / "config.json").read_text())
+        shapes = {key: feature["shape"] for key, feature in config["input_features"].items()}
+        assert shapes == {"observation.state": [4], "observation.environment_state": [39]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_policy_solves_starts(name):
+    """Two of three easy starts: another processor may round a trial the other way."""
+    from lerobot_roborecover.build.initial_success import evaluate
+
+    tried = evaluate(SHIPPED / name, ["push-v3", "coffee-push-v3", "assembly-v3"], trials=1)
+    assert sum(one.solved for one in tried.values()) >= 2
