@@ -77,7 +77,7 @@ class CollectOptions:
     seed: int = 7
     """Of the perturbation, of the policy's noise, and of drivers that draw."""
     horizon: int = 0
-    """Budget of each task in steps, of the rollouts and of the scenarios made from them; 0: the platform's."""
+    """Budget of each task in steps, of rollouts and of scenarios made from them; 0: the platform's."""
     film_every: int = 1
     """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
@@ -108,7 +108,8 @@ class CollectOptions:
             check_expert(self.platform, self.expert)
         for name, low, high in (
             ("perturbed_steps", 1, 100_000), ("seed", 0, 2**32 - 1), ("slots", 0, 1024),
-            ("horizon", 0, 10_000), ("max_batch", 1, 4096), ("part_size", 1, 10_000), ("watchdog_s", 1, 86_400),
+            ("horizon", 0, 10_000), ("max_batch", 1, 4096), ("part_size", 1, 10_000),
+            ("watchdog_s", 1, 86_400),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 option = name.removesuffix("_s").replace("_", "-")

@@ -23,6 +23,7 @@ from typing import Literal
 from lerobot_roborecover.build.agreement import Agreement, agreement
 from lerobot_roborecover.build.annotate.discussion import MAX_ROUNDS, Discussion
 from lerobot_roborecover.build.annotate.votes import Vote, ballot, read_votes
+from lerobot_roborecover.build.auto_annotate.annotators import label_kind
 from lerobot_roborecover.build.candidates import CandidateSet
 from lerobot_roborecover.build.funnel import (
     Decision,
@@ -33,6 +34,14 @@ from lerobot_roborecover.build.funnel import (
 )
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+
+NOT_PEOPLES = {
+    "people": "",
+    "automatic": "Recovery points, stages and types are automatic labels, not people's: programs applied "
+    "written rules to what the annotation page shows.",
+    "mixed": "Some votes behind recovery points, stages and types are programs', not people's.",
+}
+"""What a dataset's description says of its labels, by their kind."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,11 @@ class Resolution:
     annotators: tuple[str, ...]
     rounds: int
     """The latest round with votes."""
+
+    @property
+    def kind(self) -> str:
+        """Whose votes these are: `people`, `automatic` or `mixed`."""
+        return label_kind(self.annotators)
 
     def counts(self) -> dict[str, int]:
         """Number of candidates by outcome."""
@@ -187,7 +201,8 @@ def _check_vote(candidates: CandidateSet, name: str, vote: Vote) -> None:
 def decisions_of(resolution: Resolution, config: ResolutionConfig) -> list[Decision]:
     """The stage's decisions; candidates that wait for votes or a discussion are undecided."""
     found = []
-    by = f"votes of {', '.join(resolution.annotators)}"
+    whose = {"people": "votes", "automatic": "automatic votes", "mixed": "votes, some automatic,"}
+    by = f"{whose[resolution.kind]} of {', '.join(resolution.annotators)}"
     for r in resolution.candidates:
         if r.outcome == "kept":
             verdict = "kept"
@@ -214,7 +229,13 @@ def scenarios_of(
             r.step or 0,
             r.stage,
             r.deviation,
-            {"annotation": {**rule, "votes": [asdict(v) for v in r.votes]}},
+            {
+                "annotation": {
+                    "kind": label_kind(v.annotator for v in r.votes),
+                    **rule,
+                    "votes": [asdict(v) for v in r.votes],
+                }
+            },
         )
         for r in resolution.candidates
         if r.outcome == "kept"
@@ -247,6 +268,7 @@ def write_resolution(
     if not scenarios:
         raise ScenarioError(f"no candidate is resolved to a scenario yet: {resolution.counts()}")
     record_decisions(candidates.root, decisions_of(resolution, config))
+    description = " ".join(filter(None, (description, NOT_PEOPLES[resolution.kind])))
     write_scenarios(root, scenarios, description=description, license=license)
     carry_decisions(candidates.root, root)
     return root

@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.build.candidates import read_candidates
     from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
     from lerobot_roborecover.build.resolution import (
+        NOT_PEOPLES,
         ResolutionConfig,
         resolve,
         write_discussion,
@@ -44,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     config = ResolutionConfig(args.votes_needed, args.tolerance, args.no_consensus)
     found = resolve(candidates, votes_folder(args.dataset, args.votes), config)
     print(f"{len(found.annotators)} annotators: {', '.join(found.annotators)}; round {found.rounds}")
+    if NOT_PEOPLES[found.kind]:
+        print(NOT_PEOPLES[found.kind])
     print(format_agreement(found.agreement))
     print(", ".join(f"{n} {outcome}" for outcome, n in sorted(found.counts().items())))
     if args.discuss:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 PREFIX = "auto-"
 """Of every automatic annotator's name, and of nobody else's."""
@@ -56,3 +57,11 @@ EYES: Mapping[str, Eye] = {
 def is_automatic(annotator: str) -> bool:
     """Whether a name is an automatic annotator's."""
     return annotator.startswith(PREFIX)
+
+
+def label_kind(annotators: Iterable[str]) -> Literal["people", "automatic", "mixed"]:
+    """Whose labels come from these annotators' votes."""
+    kinds = {is_automatic(name) for name in annotators}
+    if len(kinds) > 1:
+        return "mixed"
+    return "automatic" if True in kinds else "people"
