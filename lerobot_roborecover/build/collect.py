@@ -474,9 +474,10 @@ def _write(
         versions = one.receive()
         if not isinstance(versions, dict):
             raise ScenarioError(f"no simulator could be made to film with: {versions.message}")
+        films = {k: v for k, v in slot.options.items() if k not in ("assets_dir", "robotwin_root")}
         writing = Writing(
             book.records, work / "parts", pool, _slot_count(options), round(pool.spaces()["hz"]), versions,
-            f"{options.frames}/{options.film_every}", options.film_every, options.part_size,
+            f"{options.frames}/{options.film_every}", options.film_every, films, options.part_size,
             options.description, options.license,
         )  # fmt: skip
         count, line = _Count(0, len(kept)), ProgressLine("writing", detailed=True, unit="candidates")

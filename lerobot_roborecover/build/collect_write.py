@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,9 @@ class Writing:
     """What is filmed; names the parts, so that another size is filmed anew."""
     film_every: int = 1
     """Steps from one picture to the next."""
+    film_options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the simulator that films, as far as they do not name folders; kept with every candidate, so that
+    what was seen can be rendered again."""
     part_size: int = 20
     """Candidates of a part: what is lost, at most, when the writing is stopped."""
     description: str = ""
@@ -200,10 +203,12 @@ def _films(
                 f"up to {1e3 * film.error_m:.2f} mm apart (limit {1e3 * HANDOFF_TOLERANCE_M:g} mm)",
             )
             continue
-        yield _recording(v, read_record(record_path(writing.records, v.scenario.id)), film)
+        record = read_record(record_path(writing.records, v.scenario.id))
+        filmed = {"every": writing.film_every, "options": dict(writing.film_options)}
+        yield _recording(v, record, film, filmed)
 
 
-def _recording(v: Verdict, record: Record, film: Filmed) -> Recording:
+def _recording(v: Verdict, record: Record, film: Filmed, filmed: Mapping[str, Any]) -> Recording:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     scenario = v.scenario
@@ -216,7 +221,7 @@ def _recording(v: Verdict, record: Record, film: Filmed) -> Recording:
             frames=(to_frame(scenario.platform, o) for o in film.observations),
             success=False,
             reset=record.reset,
-            provenance={"collect": v.notes or {}},
+            provenance={"collect": {**(v.notes or {}), "film": filmed}},
         ),
         record.steps,
         *((v.exclusion.reason, v.exclusion.detail, f"rule {v.exclusion.rule}") if v.exclusion else ()),
