@@ -33,6 +33,7 @@ COMMANDS = (
     "annotate",
     "agree",
     "screen",
+    "validate",
     "split",
 )
 """Each is a module of this folder (dashes as underscores) with `HELP`, `add_arguments(parser)` and

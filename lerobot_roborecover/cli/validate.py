@@ -1,0 +1,100 @@
+"""`roborecover validate`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = (
+    "Replay screening runs of every scenario and keep the scenarios whose recovery point comes back as it "
+    "was recorded."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add = parser.add_argument
+    add("dataset", type=Path, help="folder of a screened scenario dataset")
+    add("--trials-folder", required=True, type=Path, metavar="DIR", help="where screen kept the trials")
+    add(
+        "--candidates", action="append", default=[], type=Path, metavar="DIR",
+        help="candidate dataset that the scenarios were made from: original poses and frames; may be given "
+        "again",
+    )  # fmt: skip
+    add("--out", required=True, type=Path, help="folder of the new dataset")
+    add("--runs", type=int, default=3, help="screening runs drawn of each scenario (%(default)s)")
+    add("--seed", type=int, default=42, help="of the draw (%(default)s)")
+    add("--tolerance-mm", type=float, default=2.0, help="of end effectors and objects (%(default)s)")
+    add("--min-ssim", type=float, default=0.99, help="the mean SSIM must exceed it (%(default)s)")
+    add("--no-frames", action="store_true", help="compare states alone; the provenance says so")
+    add("--no-outcomes", action="store_true", help="do not compare how the screening runs end")
+    add(
+        "--env", action="append", default=[], metavar="KEY=VALUE",
+        help="option of the recovery env type, as the originals were rendered; may be given again",
+    )  # fmt: skip
+    add("--reject", action="append", default=[], metavar="ID", help="on looking at the sheets; repeat it")
+    add("--reason", default="", help="why, for every --reject")
+    add(
+        "--rejects", type=Path, metavar="FILE",
+        help="the same as a file: a line each, the id, a blank, the reason",
+    )  # fmt: skip
+    add("--accept", action="append", default=[], metavar="ID", help="take a rejection back")
+    add("--by", default="a person", metavar="NAME", help="who looked (%(default)s)")
+    add("--workers", type=int, default=1, help="processes that replay (%(default)s)")
+    add("--limit-s", type=float, default=900, help="for one scenario's replays (%(default)s)")
+    add("--work", type=Path, metavar="DIR", help="replays and sheets, kept between runs (OUT.replays)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Validates, and prints the distribution and the funnel."""
+    from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
+    from lerobot_roborecover.build.validate_dataset import ValidationRequest, validate_dataset
+    from lerobot_roborecover.build.validation import ValidationRule, format_validation
+
+    rule = ValidationRule(
+        args.runs, args.seed, args.tolerance_mm, args.min_ssim, not args.no_frames, not args.no_outcomes
+    )
+    rejects = {**_read_rejects(args.rejects), **dict.fromkeys(args.reject, args.reason)}
+    request = ValidationRequest(
+        dataset=args.dataset,
+        trials_folder=args.trials_folder,
+        out=args.out,
+        candidates=args.candidates,
+        rule=rule,
+        env=args.env,
+        rejects=rejects,
+        accepts=args.accept,
+        by=args.by,
+        workers=args.workers,
+        limit_s=args.limit_s,
+        work=args.work,
+    )
+    made = validate_dataset(request, _progress)
+    print(format_validation(made.replays, made.decisions, rule), end="\n\n")
+    print(format_funnel(funnel(read_decisions(args.out))))
+    print(f"\n{args.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out")
+    return 0
+
+
+def _read_rejects(path: Path | None) -> dict[str, str]:
+    from lerobot_roborecover.scenario import ScenarioError
+
+    if path is None:
+        return {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise ScenarioError(f"--rejects {path} cannot be read: {err}") from None
+    found = {}
+    for number, line in enumerate(lines, 1):
+        one, _, reason = line.strip().partition(" ")
+        if one and not one.startswith("#"):
+            if not reason.strip():
+                raise ScenarioError(f"{path}, line {number}: {one:.140} has no reason; write: ID REASON")
+            found[one] = reason.strip()
+    return found
+
+
+def _progress(done: int, total: int) -> None:
+    print(f"\rreplayed {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True)
