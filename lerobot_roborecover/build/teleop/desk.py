@@ -86,6 +86,7 @@ class Desk(threading.Thread):
             return
         rate = min(self._rate_hz or simulator.control_hz, simulator.control_hz)
         self.pilot.rate_hz, self.pilot.control_hz = rate, simulator.control_hz
+        self._hub.publish(self._status())
         self.ready.set()
         try:
             while not self._stopped.is_set():
@@ -209,6 +210,9 @@ class Desk(threading.Thread):
 
     def _do_mark(self, sent: dict[str, Any]) -> None:
         self._session.set_mark(plain_text(sent, "stage"), plain_text(sent, "deviation"))
+
+    def _do_relabel(self, sent: dict[str, Any]) -> None:
+        self._session.relabel(plain_text(sent, "stage"), plain_text(sent, "deviation"))
 
     def _do_unmark(self, _sent: dict[str, Any]) -> None:
         self._session.mark = None

@@ -75,7 +75,9 @@ class Pilot:
     _queue: queue.Queue[Command | tuple[str, Hold]] = field(default_factory=lambda: queue.Queue(MAX_WAITING))
     _holds: dict[str, Hold] = field(default_factory=dict)
     _owed: int = 0
-    """Steps for the gripper, and at least one for whatever was pressed, however briefly."""
+    """Steps for the gripper."""
+    _fresh: set[str] = field(default_factory=set)
+    """Devices whose hold no step was taken for yet."""
     _last: float = 0.0
     _device: str = "keyboard"
 
@@ -97,6 +99,7 @@ class Pilot:
     def let_go(self) -> None:
         """Forgets what is held and owed; the simulator's thread alone."""
         self._holds.clear()
+        self._fresh.clear()
         self._owed = 0
         self.realtime = False
 
@@ -131,12 +134,16 @@ class Pilot:
             if isinstance(item, Command):
                 return item
             device, held = item
+            # However briefly something was pressed: it gets a step before what comes after it.
+            tick = self._tick(now) if drive and device in self._fresh else None
             before = self._holds.get(device)
             self._holds[device] = held
             if held.active:
                 self._device = device
                 if before is None or not before.active:
-                    self._owed = max(self._owed, 1)
+                    self._fresh.add(device)
+            if tick is not None:
+                return tick
 
     def _due(self, now: float) -> float | None:
         """When the next step is due; None while time stands still."""
@@ -149,6 +156,7 @@ class Pilot:
 
     def _tick(self, due: float) -> Tick:
         self._last = due
+        self._fresh.clear()
         self._owed = max(self._owed - 1, 0)
         total = np.clip(np.sum([h.axes for h in self._holds.values()] or [(0.0,) * 6], axis=0), -1.0, 1.0)
         return Tick(tuple(float(v) for v in total), self.closed, self._device)

@@ -20,7 +20,7 @@ MAX_ACTIONS = 256
 MAX_BACK = 20_000
 MAX_TEXT = 200
 COMMANDS = (
-    "start", "act", "back", "mark", "unmark", "finish", "discard", "gripper", "realtime", "status",
+    "start", "act", "back", "mark", "relabel", "unmark", "finish", "discard", "gripper", "realtime", "status",
     "hand_back",
 )  # fmt: skip
 """Each is answered, and only taken from whoever drives."""

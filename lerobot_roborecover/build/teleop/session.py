@@ -154,17 +154,24 @@ class Session:
             ScenarioError: no recovery point can be here.
         """
         self._require()
-        if stage not in ("", *Stage) or deviation not in ("", *DeviationType):
-            raise ScenarioError(
-                f"stage {stage!r:.40} and type {deviation!r:.40} must be empty or one of "
-                f"{', '.join(Stage)}; {', '.join(DeviationType)}"
-            )
+        _check_labels(stage, deviation)
         if self.step <= self._start.reset.settle_steps:
             raise ScenarioError("nothing has happened yet: make a deviation first, then mark it")
         if self.solved[-1]:
             raise ScenarioError("the task is solved here; there is nothing to recover from")
         self.mark = Mark(self.step, stage, deviation)
         return self.mark
+
+    def relabel(self, stage: str, deviation: str) -> None:
+        """Gives the mark other labels, where it is.
+
+        Raises:
+            ScenarioError: there is no mark, or a label is none.
+        """
+        _check_labels(stage, deviation)
+        if self.mark is None:
+            raise ScenarioError("nothing is marked yet")
+        self.mark = replace(self.mark, stage=stage, deviation=deviation)
 
     # --- what became of it
 
@@ -234,3 +241,11 @@ class Session:
         if self._trail is None:
             raise ScenarioError("nothing is under way; start a task first")
         return self._trail
+
+
+def _check_labels(stage: str, deviation: str) -> None:
+    if stage not in ("", *Stage) or deviation not in ("", *DeviationType):
+        raise ScenarioError(
+            f"stage {stage!r:.40} and type {deviation!r:.40} must be empty or one of {', '.join(Stage)}; "
+            f"{', '.join(DeviationType)}"
+        )

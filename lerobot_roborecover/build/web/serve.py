@@ -28,7 +28,7 @@ def listen(port: int) -> socket.socket:
     Raises:
         ScenarioError: the port is taken, or none.
     """
-    # With the protocol named, asyncio turns Nagle's algorithm off: small answers do not wait for the last one.
+    # With the protocol named, asyncio turns Nagle's algorithm off: small answers wait for nothing.
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
