@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import lerobot_roborecover  # noqa: F401 - before numpy: it pins how simulators round
+
 sys.path.insert(0, str(Path(__file__).parent))
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("OMP_NUM_THREADS", "1")

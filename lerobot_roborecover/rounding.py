@@ -1,0 +1,54 @@
+"""One rounding for every processor.
+
+OpenBLAS chooses its kernels by what the processor can do, and they round the last bit differently: with
+AVX-512 kernels instead of AVX2 ones no LIBERO state was the same, and contacts made up to 4.6 mm of it
+(docs/exactness.md). So simulators compute with the AVX2 kernels everywhere. NumPy's own dispatch, numba's
+and the C library's made no difference.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+
+VARIABLE = "OPENBLAS_CORETYPE"
+CORE_TYPE = "Haswell"
+"""AVX2 and FMA: every x86-64 processor since 2015 has them."""
+
+
+def pin_rounding() -> None:
+    """Chooses the kernels for this process and its children, unless the user has.
+
+    OpenBLAS reads the choice when it is loaded: call this before numpy is imported. On a processor that
+    lacks the kernels nothing is chosen, since they would crash it.
+    """
+    if VARIABLE not in os.environ and has_kernels():
+        os.environ[VARIABLE] = CORE_TYPE
+
+
+def has_kernels(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
+    """Whether this processor has AVX2 and FMA, as far as Linux tells."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return False
+    try:
+        flags = next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "")
+    except OSError:
+        return False
+    return {"avx2", "fma"} <= set(flags.split())
+
+
+def core_type_in_use() -> str:
+    """Kernels of the OpenBLAS that numpy has loaded, as OpenBLAS names them; empty where it cannot tell."""
+    import ctypes
+
+    import numpy as np
+
+    libraries = Path(np.__file__).parent.with_name("numpy.libs")
+    for path in sorted(libraries.glob("*openblas*")):
+        for name in ("scipy_openblas_get_corename64_", "openblas_get_corename64_", "openblas_get_corename"):
+            function = getattr(ctypes.CDLL(str(path)), name, None)
+            if function is not None:
+                function.restype = ctypes.c_char_p
+                return function().decode()
+    return ""

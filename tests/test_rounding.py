@@ -1,0 +1,51 @@
+"""Simulators round alike on every processor that can (`lerobot_roborecover/rounding.py`)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from lerobot_roborecover.rounding import CORE_TYPE, VARIABLE, has_kernels
+
+needs_kernels = pytest.mark.skipif(not has_kernels(), reason="this processor has no AVX2")
+CODE = "from lerobot_roborecover.rounding import core_type_in_use; print(core_type_in_use())"
+
+
+def core_type(code: str = CODE, **environment: str) -> str:
+    clean = {k: v for k, v in os.environ.items() if k != VARIABLE}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**clean, **environment}, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+@needs_kernels
+def test_the_package_chooses_the_kernels():
+    assert core_type() == CORE_TYPE
+
+
+@needs_kernels
+def test_the_user_comes_first():
+    assert core_type(**{VARIABLE: "Sandybridge"}) == "Sandybridge"
+
+
+@needs_kernels
+def test_workers_inherit_them_even_if_numpy_was_there_before():
+    code = f"import numpy, os; import lerobot_roborecover; print(os.environ['{VARIABLE}'])"
+    assert core_type(code) == CORE_TYPE
+
+
+@pytest.mark.parametrize(
+    ("flags", "found"), [("fpu avx avx2 fma", True), ("fpu avx fma", False), ("fpu avx2", False), ("", False)]
+)
+def test_kernels_that_would_crash_the_processor_are_not_chosen(tmp_path, monkeypatch, flags, found):
+    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text(f"processor\t: 0\nflags\t\t: {flags}\n")
+    assert has_kernels(cpuinfo) is found
+    assert not has_kernels(tmp_path / "missing")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert not has_kernels(cpuinfo)
