@@ -37,7 +37,7 @@ LIMIT_STEPS = 60
 """Last steps of a rollout, at least, in which a joint is at its limit and the end effector stays."""
 PRESSING_SHARE = 0.8
 """Last part of a rollout, at least, in which the end effector is told to move and stays. That a policy ends
-stuck is an ordinary failure, with a recovery point before it; in so much of a rollout there is nothing else."""
+stuck is an ordinary failure, with a recovery point before it; here there is next to nothing before it."""
 PRESSING_COMMAND = 0.5
 """Translation of a command, (-1 to 1), that asks for motion."""
 STAYS_M = 0.02

@@ -52,7 +52,7 @@ class RolloutBook:
     """
 
     def __init__(self, work: Path):
-        self.records = work / RECORDS_FOLDER
+        self.work, self.records = work, work / RECORDS_FOLDER
         self._journal = Journal(work / ROLLOUTS_FILE, SCHEMA_VERSION)
         self._ended: dict[str, Ended] = {}
         for row in self._journal.records:

@@ -98,8 +98,8 @@ def _pairs(argv: Sequence[str]) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]):
-    from lerobot_roborecover.build.collect import CollectOptions
     from lerobot_roborecover.build.collect_judge import Judging
+    from lerobot_roborecover.build.collect_options import CollectOptions
     from lerobot_roborecover.build.collect_starts import Starts, parse_numbers
     from lerobot_roborecover.env.options import OptionError
 
