@@ -28,7 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fps", type=float, default=15.0, help="live pictures a second, at most (%(default)s)")
     add("--view", type=int, default=256, metavar="PIXELS", help="size of the live pictures (%(default)s)")
     add("--size", type=int, metavar="PIXELS", help="size of the dataset's pictures (the platform's own)")
-    add("--spacemouse", action="store_true", help="drive with one that is plugged into this machine, too")
+    add(
+        "--spacemouse", type=float, nargs="?", const=0.5, metavar="SPEED",
+        help="drive with one that is plugged into this machine, too; SPEED is up to 1 (%(const)s)",
+    )  # fmt: skip
     add("--assets-dir", help="LIBERO's assets (found by itself where LeRobot finds them)")
     add("--write", action="store_true", help="only write what earlier sessions saved into the dataset")
 
@@ -47,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
         ("--fps", args.fps, 0.1, 120.0),
         ("--view", args.view, 16, 2048),
         ("--size", args.size, 16, 2048),
+        ("--spacemouse", args.spacemouse, 0.01, 1.0),
     ):
         if value is not None and not low <= value <= high:
             raise OptionError(f"{option} {value} is not from {low:g} to {high:g}")

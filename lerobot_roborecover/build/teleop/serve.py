@@ -11,6 +11,7 @@ from lerobot_roborecover.build.annotate.votes import check_name
 from lerobot_roborecover.build.teleop.controls import controls_of
 from lerobot_roborecover.build.teleop.desk import Desk
 from lerobot_roborecover.build.teleop.hub import Hub
+from lerobot_roborecover.build.teleop.spacemouse import SpaceMouse
 from lerobot_roborecover.build.teleop.starts import StartPoint
 from lerobot_roborecover.build.teleop.store import Store, read_recording
 from lerobot_roborecover.build.teleop.write import check_open, recordings_folder, write_dataset
@@ -41,7 +42,8 @@ class TeleopConfig:
     """Rows and columns of the live pictures."""
     size: int | None = None
     """Rows and columns of the dataset's pictures; None for the platform's own."""
-    spacemouse: bool = False
+    spacemouse: float | None = None
+    """What the end of a SpaceMouse's range gives, up to 1; None reads none."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the simulator, beside its pictures."""
 
@@ -85,7 +87,10 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
             desk.ready.wait()
             if desk.error is not None:
                 raise desk.error
-            mouse = _spacemouse(desk) if config.spacemouse else None
+            mouse = None
+            if config.spacemouse is not None:
+                mouse = SpaceMouse(desk.pilot, config.spacemouse)
+                mouse.start()
             token = kept_tokens("teleop", config.dataset, [operator])[operator]
             say(f"{operator}: {len(config.starts)} starts  http://{HOST}:{port}/{NAME}/?token={token}")
             say(f"recordings are kept in {store.folder}; Ctrl-C stops and writes {config.dataset}")
@@ -147,11 +152,3 @@ def _check_platform(store: Store, platform: str) -> None:
         raise ScenarioError(
             f"{store.folder} holds recordings of {found}, not {platform}; name another dataset"
         )
-
-
-def _spacemouse(desk: Desk) -> Any:
-    from lerobot_roborecover.build.teleop.spacemouse import SpaceMouse
-
-    mouse = SpaceMouse(desk.pilot)
-    mouse.start()
-    return mouse

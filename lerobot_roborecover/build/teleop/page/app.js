@@ -98,7 +98,11 @@ const ACTIONS = {
 TYPES.forEach((name, i) => { ACTIONS[`Digit${i + 1}`] = () => label("types", name); });
 STAGES.forEach((name, i) => { ACTIONS[`Digit${i + 5}`] = () => label("stages", name); });
 
+const IN_TAKEOVERS = ["Space", "KeyH", "KeyV", "KeyX", "Minus", "Equal"];
+
 function press(code, shift) {
+  if (status.mode === "takeover" && !IN_TAKEOVERS.includes(code)) return;
+  if (status.mode === "takeover" && !status.under_way && code !== "KeyV") return say("no policy has handed over yet");
   ACTIONS[code]?.(shift);
 }
 
