@@ -13,6 +13,7 @@ from lerobot_roborecover import __version__
 COMMANDS = (
     "doctor",
     "demo",
+    "study",
     "check-policy",
     "eval",
     "merge",
@@ -35,6 +36,7 @@ COMMANDS = (
     "screen",
     "validate",
     "split",
+    "build",
 )
 """Each is a module of this folder (dashes as underscores) with `HELP`, `add_arguments(parser)` and
 `run(args) -> exit status`; or, where another parser reads the arguments, with `HELP` and

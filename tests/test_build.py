@@ -1,0 +1,213 @@
+"""The chain from one file: what is refused, what runs again, and that it can be stopped anywhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lerobot_roborecover.build.annotate.votes import SCHEMA_VERSION as VOTES_SCHEMA
+from lerobot_roborecover.build.candidates import read_candidates
+from lerobot_roborecover.build.chain import STAGES, Chain
+from lerobot_roborecover.build.chain_config import read_config
+from lerobot_roborecover.build.chain_summary import markdown
+from lerobot_roborecover.build.funnel import FunnelRow
+from lerobot_roborecover.build.journal import Journal
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.datasets import read_scenarios
+from lerobot_roborecover.env.options import OptionError
+
+EXAMPLE = Path(__file__).parents[1] / "policies" / "build" / "metaworld.yaml"
+FAKE = {
+    "platform": "fake",
+    "collect": {
+        "biased": {"expert": "expert_biased", "task": ["push-*"], "draw": 4, "frames": 32, "slots": 1},
+        "shaken": {
+            "expert": "expert_biased", "task": ["push-left"], "draw": 2, "perturb": True, "frames": 32,
+            "slots": 1,
+        },
+    },
+    "screen": {"trials": 2, "keep": [0, 99], "slots": 1},
+    "validate": {"runs": 2, "workers": 2},
+    "split": {"sizes": {"train": 0.5, "test": 0.5}},
+}  # fmt: skip
+
+
+def write(path: Path, content: dict) -> Path:
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def changed(content: dict, key: str, value) -> dict:
+    """A copy with one entry, `a.b.c`, set or, with None, taken out."""
+    content = json.loads(json.dumps(content))
+    *path, last = key.split(".")
+    node = content
+    for part in path:
+        node = node.setdefault(part, {})
+    node.pop(last, None) if value is None else node.update({last: value})
+    return content
+
+
+WHOLE = {**FAKE, "out": "x", "screen": {**FAKE["screen"], "policies": [{"path": "p"}]}}
+
+
+@pytest.mark.lerobot
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("colect", {}, "unknown key colect; did you mean collect?"),
+        ("screen.trails", 5, "unknown key screen.trails; did you mean trials?"),
+        ("collect.biased.perturbed", True, "unknown key collect.biased.perturbed; did you mean perturb"),
+        ("publish.repo", "a/b", "unknown key publish.repo; did you mean repo_id"),
+        ("out", None, "out is missing"),
+        ("platform", "mars", "'mars' is not one of libero"),
+        ("collect", {}, "collect is empty"),
+        ("collect.biased.policy", "p", "give one of dataset, policy and expert"),
+        ("collect.shaken", {"dataset": "d", "draw": 3}, "leave out draw"),
+        ("collect.a/b", {"expert": "x"}, "a name is letters"),
+        ("screen.policies", None, "screen.policies is empty"),
+        ("screen.policies", [{"name": "a"}], "path is missing"),
+        ("screen.policies", [{"path": "a", "options": {"k": 1}}], "need a name"),
+        ("screen.policies", [{"pth": "a"}], "unknown key screen.policies.0.pth; did you mean path"),
+        ("screen.keep", [1], "two numbers"),
+        ("screen.trials", "many", "trials"),
+        ("split.sizes", {"train": 1}, "at least two splits"),
+        ("annotate.no_consensus", "vote", "drop or discuss"),
+        ("publish", {}, "repo_id is missing"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, key, value, words):
+    with pytest.raises(OptionError, match=r"build\.yaml") as caught:
+        read_config(write(tmp_path / "build.yaml", changed(WHOLE, key, value)))
+    assert words in str(caught.value), str(caught.value)
+
+
+@pytest.mark.lerobot
+def test_the_example_can_be_read_and_tried(tmp_path, monkeypatch, capsys):
+    read_config(write(tmp_path / "whole.yaml", WHOLE))
+    config = read_config(EXAMPLE)
+    assert config.split.sizes == {"train": 0.8, "test": 0.2}
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", str(EXAMPLE), "--dry-run"]) == 0
+    assert capsys.readouterr().out.count("would run") == 8
+    for text, words in (("- a\n", "not a map"), ("a: [", "not YAML")):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(OptionError, match=words):
+            read_config(tmp_path / "bad.yaml")
+    with pytest.raises(OptionError, match="--from nowhere: not one of"):
+        Chain(config, lambda argv: 0).build("nowhere")
+    with pytest.raises(OptionError, match="come in the order"):
+        Chain(config, lambda argv: 0).build("split", "collect")
+
+
+def test_the_funnel_as_markdown():
+    text = markdown([FunnelRow("collect", 5, 3, (("stuck | jammed", 2),), 0)])
+    assert "| collect | 5 | 3 | 2 | 0 |" in text
+    assert "| collect | 2 | stuck / jammed |" in text
+
+
+def vote_for_all(root: Path) -> int:
+    """Three annotators mark the same everywhere; the last one discards the first candidate, alone."""
+    candidates = read_candidates(root / "candidates")
+    for name in ("ann", "bob", "cleo"):
+        with Journal(root / "votes" / f"{name}.jsonl", VOTES_SCHEMA) as journal:
+            journal.append(*(vote(c.id, name) for c in candidates.candidates))
+    return len(candidates)
+
+
+def vote(candidate: str, name: str) -> dict:
+    return {
+        "kind": "vote", "uid": f"{name}-{candidate}", "candidate": candidate, "verdict": "recovery",
+        "step": 12, "stage": "Approach", "deviation": "Wrong Pose", "reason": "", "comment": "", "round": 1,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def build(tmp_path, monkeypatch):
+    """Runs the command with a content; counts what was loaded."""
+    from push_checkpoints import load_push_host, push_checkpoints
+
+    loads = []
+    monkeypatch.setattr(
+        "lerobot_roborecover.evaluate.runner.load_host", lambda c: loads.append(c) or load_push_host(c)
+    )
+    policies = [{"path": str(p), "name": p.name} for p in push_checkpoints(tmp_path / "policies")[:2]]
+    whole = {**FAKE, "out": str(tmp_path / "out"), "screen": {**FAKE["screen"], "policies": policies}}
+
+    def run(*args: str, content: dict = whole) -> int:
+        return main(["build", str(write(tmp_path / "build.yaml", content)), *args])
+
+    run.whole, run.loads, run.root = whole, loads, tmp_path / "out"
+    return run
+
+
+def ran(text: str) -> list[str]:
+    return [line.removesuffix(": runs") for line in text.splitlines() if line.endswith(": runs")]
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_from_rollouts_to_splits(build, capsys):
+    assert build("--until", "collect") == 0
+    assert ran(capsys.readouterr().out) == ["collect biased", "collect shaken"]
+    # People are waited for, as often as it takes.
+    for _ in range(2):
+        assert build() == 1
+        text = capsys.readouterr().out
+        assert "wait for votes (3 each)" in text
+    assert ran(text) == ["annotate"]
+    count = vote_for_all(build.root)
+    assert build() == 0
+    text = capsys.readouterr().out
+    assert ran(text) == ["annotate", "agree", "screen", "validate", "split"]
+    assert f"to publish: roborecover publish {build.root / 'split'} --repo-id ORG/NAME" in text
+    final = read_scenarios(build.root / "split")
+    assert 4 <= len(final) <= count
+    assert {s.split for s in final} == {"train", "test"}
+    for scenario in final:
+        assert set(scenario.provenance) >= {"annotation", "screening", "validation", "rollout"}
+        assert scenario.provenance["validation"]["mean_ssim"] > 0.99
+    funnel = (build.root / "summary" / "funnel.md").read_text()
+    for stage in ("collect", "annotate", "screen", "validate", "split"):
+        assert f"| {stage} |" in funnel
+    assert (build.root / "summary" / "build.yaml").is_file()
+    assert "leakage by trajectory: none" in (build.root / "summary" / "splits.txt").read_text()
+
+    # Nothing has changed, nothing runs; a faster pace is no change.
+    loads = len(build.loads)
+    assert build(content=changed(build.whole, "validate.workers", 1)) == 0
+    assert ran(capsys.readouterr().out) == []
+    # What is changed is made anew, with all after it, from the trials and replays that are there.
+    replays = (build.root / "validated.replays" / "replays.jsonl").read_bytes()
+    assert build(content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    text = capsys.readouterr().out
+    assert ran(text) == ["screen", "validate", "split"]
+    assert len(build.loads) == loads, "no trial runs again"
+    assert (build.root / "validated.replays" / "replays.jsonl").read_bytes() == replays
+    assert sorted(p.name for p in (build.root / "old").iterdir()) == ["screened-1", "split-1", "validated-1"]
+    assert build("--from", "split", content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    assert ran(capsys.readouterr().out) == ["split"]
+    # A later vote counts.
+    with Journal(build.root / "votes" / "dora.jsonl", VOTES_SCHEMA) as journal:
+        journal.append(vote(final[0].id, "dora"))
+    assert build("--until", "agree", content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    assert ran(capsys.readouterr().out) == ["agree"]
+
+
+@pytest.mark.lerobot
+def test_a_stage_that_fails_stops_the_chain_and_is_run_again(tmp_path):
+    config = read_config(write(tmp_path / "b.yaml", {**WHOLE, "out": str(tmp_path / "out")}))
+    calls: list[str] = []
+
+    def fail(argv: list[str]) -> int:
+        calls.append(argv[0])
+        return 2
+
+    for _ in range(2):
+        with pytest.raises(Exception, match="ended with status 2"):
+            Chain(config, fail, lambda line: None).build()
+    assert calls == ["collect", "collect"]
+    assert STAGES[0] == "collect"
