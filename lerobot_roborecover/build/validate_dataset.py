@@ -7,6 +7,7 @@ their page, and what people decided on looking at them (`rejects.jsonl`). A reru
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import os
 import shutil
@@ -38,6 +39,7 @@ from lerobot_roborecover.datasets.frames import KEPT
 from lerobot_roborecover.datasets.new_folder import check_new
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 from lerobot_roborecover.versions import REQUIRED, installed
@@ -114,6 +116,11 @@ def validate_dataset(
         OptionError: an option of the env type cannot be used.
     """
     check_replaceable(request.out)
+    if request.rule.frames and importlib.util.find_spec("skimage") is None:
+        raise OptionError(
+            "frames are compared with scikit-image, which is not installed: pip install "
+            "'lerobot_env_roborecover[build]', or go without: --no-frames"
+        )
     scenarios, manifest = read_with_manifest(request.dataset)
     trials = read_screening(request.trials_folder)
     sets = [read_candidates(path) for path in request.candidates]
