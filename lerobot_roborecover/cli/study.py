@@ -1,0 +1,60 @@
+"""`roborecover study`."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+HELP = (
+    "Re-run a study: every policy from recovery points and from initial states, the interventions, the "
+    "report, and the comparison with the stored outcomes, trial by trial."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add = parser.add_argument
+    add("--data", type=Path, help="folder of the study (default: the one that ships with the package)")
+    add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
+    add("--every", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
+    add("--slots", type=int, default=0, help="simulators at once (0: one per core)")
+    add("--print", action="store_true", help="print the commands and run nothing")
+    add("--no-report", action="store_true", help="stop after the trials and the comparison")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluates, compares, reports; exit status 1 where outcomes differ from the stored ones."""
+    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.study.commands import arms, report_command
+    from lerobot_roborecover.study.definition import read_definition, shipped_study
+    from lerobot_roborecover.study.evaluate import (
+        compare_with_stored,
+        evaluate,
+        scenario_ids,
+        write_report,
+    )
+    from lerobot_roborecover.study.outcomes import outcomes_of, write_outcomes
+
+    if args.every < 1:
+        raise OptionError(f"--every={args.every}: a count from 1")
+    study = read_definition(args.data or shipped_study())
+    if args.print:
+        todo = list(
+            arms(study, args.out, scenario_ids(study, args.every) if args.every > 1 else (), args.slots)
+        )
+        for argv in [*(a.argv for a in todo), report_command(study, todo, args.out)]:
+            print(shlex.join(["roborecover", *argv]))
+        return 0
+    done = evaluate(study, args.out, args.every, args.slots, say=lambda line: print(line, flush=True))
+    write_outcomes(args.out / "outcomes.csv", outcomes_of(done))
+    compared = compare_with_stored(study, done)
+    if not args.no_report:
+        print(f"report {write_report(study, done, args.out)}")
+        print((args.out / "report.log").read_text(errors="replace"))
+    if compared is None:
+        print("no stored outcomes to compare with", file=sys.stderr)
+        return 0
+    print(compared.text())
+    return 1 if compared.different or compared.unknown else 0

@@ -1,0 +1,98 @@
+"""Runs a study's evaluation: one command after the other, each of which goes on where it was."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.env.parent import end_with_parent
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.commands import Arm, arms, report_command
+from lerobot_roborecover.study.definition import StudyDefinition
+from lerobot_roborecover.study.outcomes import Comparison, compare, outcomes_of, read_outcomes
+
+_SHOWN_LINES = 12
+
+
+def scenario_ids(study: StudyDefinition, every: int) -> list[str]:
+    """Every n-th scenario of the study's split, in the order of their ids.
+
+    Raises:
+        ScenarioError: the split is empty.
+    """
+    found = sorted(s.id for s in load_scenarios(study.scenarios, split=study.split))
+    if not found:
+        raise ScenarioError(f"{study.scenarios} has no scenario of the split {study.split!r}")
+    return found[::every]
+
+
+def evaluate(
+    study: StudyDefinition, out: Path, every: int = 1, slots: int = 0, say: Callable[[str], None] = print
+) -> list[Arm]:
+    """Runs every arm that is not finished.
+
+    Args:
+        study: what.
+        out: folder of the results; a rerun goes on there.
+        every: take every n-th scenario.
+        slots: simulators at once; 0: one per core.
+        say: takes progress lines.
+
+    Returns:
+        The arms, all finished.
+
+    Raises:
+        ScenarioError: an arm failed; the message has the end of its output.
+    """
+    ids = scenario_ids(study, every)
+    todo = list(arms(study, out, ids if every > 1 else (), slots))
+    for number, arm in enumerate(todo, 1):
+        began = time.monotonic()
+        run_command(arm.argv, arm.out / "output.log", study)
+        rows = len(ids) * arm.trials
+        say(f"[{number}/{len(todo)}] {arm.label}: {rows} trials, {time.monotonic() - began:.0f} s")
+    return todo
+
+
+def compare_with_stored(study: StudyDefinition, done: Sequence[Arm]) -> Comparison | None:
+    """Today's outcomes against the stored ones; None where nothing is stored."""
+    if not study.outcomes.exists():
+        return None
+    return compare(read_outcomes(study.outcomes), outcomes_of(done))
+
+
+def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Path:
+    """The report page of the arms' logs."""
+    run_command(report_command(study, done, out), out / "report.log", study)
+    return out / "report" / "report.html"
+
+
+def run_command(argv: Sequence[str], log: Path, study: StudyDefinition) -> None:
+    """Runs `roborecover ARGV` as anybody would, its output into a file.
+
+    Raises:
+        ScenarioError: it failed; the message has the end of its output.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1", **os.environ, **study.environment}
+    with log.open("ab") as stream:
+        done = subprocess.run(
+            [sys.executable, "-m", "lerobot_roborecover.cli.main", *argv],
+            stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, env=environment,
+            preexec_fn=partial(end_with_parent, os.getpid()),
+        )  # fmt: skip
+    if done.returncode:
+        shown = "\n".join(
+            f"  {line}" for line in log.read_text(errors="replace").splitlines()[-_SHOWN_LINES:]
+        )
+        raise ScenarioError(
+            f"`roborecover {shlex.join(argv)}` ended with status {done.returncode}. The end of {log}:\n"
+            f"{shown}\nRun the same command again to go on with what is left"
+        )
