@@ -22,9 +22,9 @@ OTHER_MOVED_M, OTHER_REACHED_M = 0.01, 0.06
 """A part that is not to be handled was touched where it has moved this far and the hand is this near."""
 PUT_DOWN_HEIGHT_M, PUT_DOWN_M_S = 0.03, 0.15
 """An object was put down, not dropped, where the gripper was opened this low and this slowly."""
-CARRY_STEP_M, CARRY_REACH_M, CARRY_GAP_S = 0.004, 0.008, 0.2
+CARRY_STEP_M, CARRY_REACH_M, CARRY_GAP_S, CARRY_S = 0.004, 0.008, 0.2, 0.15
 """From one look to the next, at most so much later: an object goes with the hand that moves by the first
-while its distance from the hand changes by less than the second..."""
+while its distance from the hand changes by less than the second, and that for at least so long..."""
 HELD_REACH_M = 0.015
 """... and stays in the grasp while that distance stays within this."""
 PAUSE_M_S, PAUSE_S = 0.02, 0.4
@@ -134,19 +134,23 @@ class _Seen:
     def _grasps(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) bool: the object is in the grasp; it has been carried within one grasp before or now."""
         held, carried = np.zeros(self.n, bool), np.zeros(self.n, bool)
-        reach, grasp_reach, far = self._reach[self.main], None, 0.0
+        reach, grasp_reach, far, lasted = self._reach[self.main], None, 0.0, 0.0
         for i in range(1, self.n):
             by = self._travel(self.main, i - 1, i)
             along = by > CARRY_STEP_M and abs(reach[i] - reach[i - 1]) < CARRY_REACH_M
             near = reach[i] < self.eye.contact_m
-            if along and near and self.seconds[i] - self.seconds[i - 1] < CARRY_GAP_S:
-                grasp_reach, far = reach[i], far + by
-            elif grasp_reach is not None and (
-                abs(reach[i] - grasp_reach) > HELD_REACH_M or not self.closed[i]
+            gap = self.seconds[i] - self.seconds[i - 1]
+            if along and near and gap < CARRY_GAP_S:
+                grasp_reach, far, lasted = reach[i], far + by, lasted + gap
+            elif (
+                grasp_reach is None
+                or abs(reach[i] - grasp_reach) > HELD_REACH_M
+                or not self.closed[i]
+                or lasted < CARRY_S
             ):
-                grasp_reach, far = None, 0.0
-            held[i] = grasp_reach is not None
-            carried[i] = carried[i - 1] or far > self.eye.carried_m
+                grasp_reach, far, lasted = None, 0.0, 0.0
+            held[i] = lasted >= CARRY_S
+            carried[i] = carried[i - 1] or (held[i] and far > self.eye.carried_m)
         return held, carried
 
     def _releases(self) -> np.ndarray:

@@ -64,6 +64,7 @@ def write_dataset(
     options: Mapping[str, Any],
     size: int | None,
     say: Callable[[str], None],
+    film_every: int = 1,
 ) -> bool:
     """Renders the recordings that no part holds yet, and puts the dataset together.
 
@@ -74,6 +75,7 @@ def write_dataset(
         options: of the simulator, beside its pictures.
         size: rows and columns of the pictures; None for the platform's own.
         say: told the progress.
+        film_every: steps from one picture to the next; the last one stands until then.
 
     Returns:
         Whether there is anything.
@@ -102,7 +104,7 @@ def write_dataset(
             for group, part in missing:
                 recordings = [read_recording(path) for path in group]
                 say(f"rendering {done + 1} to {done + len(group)} of {len(paths)}")
-                _write_part(part, recordings, simulator)
+                _write_part(part, recordings, simulator, film_every)
                 done += len(group)
         finally:
             simulator.close()
@@ -118,7 +120,7 @@ def _part_of(folder: Path, group: list[Path]) -> Path:
     return folder / f"part-{first}-{last}"
 
 
-def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator) -> None:
+def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, film_every: int) -> None:
     versions = simulator.fingerprint()
     for recorded in recordings:
         if dict(recorded.versions) != versions:
@@ -128,14 +130,14 @@ def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator) ->
             )
     write_candidates(
         part,
-        (_as_candidate(recorded, simulator) for recorded in recordings),
+        (_as_candidate(recorded, simulator, film_every) for recorded in recordings),
         fps=round(simulator.control_hz),
         versions=versions,
         description="Driven by hand with `roborecover teleop`.",
     )
 
 
-def _as_candidate(recorded: Recorded, simulator: Simulator) -> Recording:
+def _as_candidate(recorded: Recorded, simulator: Simulator, film_every: int) -> Recording:
     count, mark = len(recorded.actions), recorded.mark
     error_m = _replay_error_m(recorded, simulator)
     reason, detail = recorded.lacks, ""
@@ -152,7 +154,7 @@ def _as_candidate(recorded: Recorded, simulator: Simulator) -> Recording:
             task=recorded.task,
             driver=recorded.operator,
             actions=recorded.actions,
-            frames=_frames(recorded, simulator),
+            frames=_frames(recorded, simulator, film_every),
             success=proven or bool(recorded.solved[-1]),
             reset=recorded.reset,
             provenance={"teleop": dict(recorded.notes)},
@@ -177,12 +179,15 @@ def _replay_error_m(recorded: Recorded, simulator: Simulator) -> float:
     return largest
 
 
-def _frames(recorded: Recorded, simulator: Simulator) -> Iterator[Mapping[str, np.ndarray]]:
+def _frames(recorded: Recorded, simulator: Simulator, film_every: int) -> Iterator[Mapping[str, np.ndarray]]:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     simulator.reset(recorded.task, recorded.reset)
-    for action in recorded.actions:
-        yield to_frame(recorded.task.platform, simulator.observe())
+    frame: Mapping[str, np.ndarray] = {}
+    for step, action in enumerate(recorded.actions):
+        if step % film_every == 0:
+            frame = to_frame(recorded.task.platform, simulator.observe())
+        yield frame
         simulator.step(action)
 
 
