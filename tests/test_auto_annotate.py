@@ -11,6 +11,7 @@ from lerobot_roborecover.build.annotate.serve import AnnotateConfig
 from lerobot_roborecover.build.annotate.votes import ballot, read_votes, votes_folder
 from lerobot_roborecover.build.auto_annotate.annotators import EYES, label_kind
 from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
+from lerobot_roborecover.build.auto_annotate.page import LOOK_EVERY
 from lerobot_roborecover.build.auto_annotate.rules import Verdict, judge
 from lerobot_roborecover.build.auto_annotate.run import annotate
 from lerobot_roborecover.build.candidates import read_candidates
@@ -37,8 +38,7 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
     first = next(iter(whole.values()))
     speed = (np.abs(np.gradient(first["reach"])) + np.abs(np.gradient(first["moved"]))) * FPS
     look = Look(Sheet("it", "do it", LAST, FPS, solved, human))
-    stride = EYES[eye].tens * 10 + EYES[eye].ones
-    for f in sorted({*range(EYES[eye].first_frame, LAST + 1, stride), LAST}):
+    for f in sorted({*range(EYES[eye].first_frame, LAST + 1, LOOK_EVERY), LAST}):
         look.readings[f] = {
             "hand": {"speed": float(speed[f]), "a3": float(closed[f])},
             **{n: {k: float(v[f]) for k, v in values.items()} for n, values in whole.items()},

@@ -35,6 +35,8 @@ from lerobot_roborecover.scenario import ScenarioError
 OPERATOR = "scripted-operator"
 STOP_STEPS, MARK_AFTER = 56, 20
 """How long it stops once the deviation is there, and when it marks it."""
+FILM_EVERY = 16
+"""Steps from one picture of the dataset to the next: software rendering is slow."""
 START_S = 300.0
 _ATTEMPT_SEEDS = (1, 2)
 
@@ -122,7 +124,7 @@ def record(
                 starts.append(replace(start, task=replace(start.task, horizon=horizon)))
             plan.append((task, way, list(range(first, len(starts)))))
     config = TeleopConfig(
-        out, "metaworld", OPERATOR, starts, port=0, rate_hz=1000.0, size=size,
+        out, "metaworld", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
         options={"render_quality": "fast"},
     )  # fmt: skip
     made: Counter[str] = Counter()

@@ -16,10 +16,6 @@ class Eye:
 
     first_frame: int = 0
     """Where it begins to look."""
-    tens: int = 1
-    """Presses of Shift and right arrow from one look to the next..."""
-    ones: int = 0
-    """... and presses of the right arrow alone after them."""
     contact_m: float = 0.10
     """The hand is at the object within this, and has to approach it beyond."""
     place_m: float = 0.10
@@ -44,10 +40,10 @@ class Eye:
 
 
 EYES: Mapping[str, Eye] = {
-    "auto-1": Eye(ones=5, tens=0),
-    "auto-2": Eye(contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018, event_m=0.04),
+    "auto-1": Eye(),
+    "auto-2": Eye(first_frame=3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018, event_m=0.04),
     "auto-3": Eye(
-        first_frame=5, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
+        first_frame=6, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
         stuck_m=0.012, event_m=0.06, stable_s=0.4,
     ),
 }  # fmt: skip

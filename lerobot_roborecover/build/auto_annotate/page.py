@@ -13,7 +13,9 @@ from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
 from lerobot_roborecover.build.auto_annotate.rules import Verdict, judge
 from lerobot_roborecover.scenario import ScenarioError
 
-WAIT_S = 60.0
+LOOK_EVERY = 10
+"""Frames from one look to the next: one press of Shift and the right arrow."""
+WAIT_S = 120.0
 """Longest that a frame or an episode may take."""
 _POLL_S = 0.004
 
@@ -102,7 +104,7 @@ class Annotator:
             look.readings[self._at] = self._read(self._at)
             if self._at == look.sheet.last:
                 return
-            self._go(min(self._at + 10 * eye.tens + eye.ones, look.sheet.last))
+            self._go(min(self._at + LOOK_EVERY, look.sheet.last))
 
     def _look_closer(self, look: Look, step: int) -> None:
         """Every frame from the look before the point up to it."""

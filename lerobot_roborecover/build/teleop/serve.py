@@ -42,6 +42,8 @@ class TeleopConfig:
     """Rows and columns of the live pictures."""
     size: int | None = None
     """Rows and columns of the dataset's pictures; None for the platform's own."""
+    film_every: int = 1
+    """Steps from one of the dataset's pictures to the next, where rendering is slow."""
     spacemouse: float | None = None
     """What the end of a SpaceMouse's range gives, up to 1; None reads none."""
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -107,7 +109,9 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
                 desk.join()
         finally:
             listener.close()
-        write_dataset(config.dataset, store, config.platform, dict(config.options), config.size, say)
+        write_dataset(
+            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+        )
     finally:
         store.close()
 
@@ -121,7 +125,9 @@ def write(config: TeleopConfig, say: Callable[[str], None]) -> None:
     store = Store(recordings_folder(config.dataset))
     try:
         _check_platform(store, config.platform)
-        write_dataset(config.dataset, store, config.platform, dict(config.options), config.size, say)
+        write_dataset(
+            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+        )
     finally:
         store.close()
 
