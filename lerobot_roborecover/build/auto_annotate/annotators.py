@@ -41,7 +41,10 @@ class Eye:
 
 EYES: Mapping[str, Eye] = {
     "auto-1": Eye(),
-    "auto-2": Eye(first_frame=3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018, event_m=0.04),
+    "auto-2": Eye(
+        first_frame=3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018,
+        event_m=0.04,
+    ),
     "auto-3": Eye(
         first_frame=6, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
         stuck_m=0.012, event_m=0.06, stable_s=0.4,
