@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import wait
 from typing import Any
 
+from lerobot_roborecover.build.collect_server import More
 from lerobot_roborecover.env.episode import SlotFailure
 from lerobot_roborecover.env.slots import WorkerSlot
 
@@ -41,7 +42,11 @@ def each[Item](
         for k in list(busy):
             slot = slots[k]
             if slot.ready is True or id(slot.ready) in ready or time.monotonic() > slot.deadline:
-                yield busy.pop(k), slot.receive()
+                reply = slot.receive()
+                if isinstance(reply, More):
+                    slot.send(command, None)
+                else:
+                    yield busy.pop(k), reply
 
 
 def in_order[Item](

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,13 @@ from lerobot_roborecover.scenario import Outcome, Reset, Scenario, Task
 from lerobot_roborecover.simulators import Observation
 
 SERVER = f"{__name__}:CollectServer"
+REPLY_EVERY_S = 5.0
+"""How long a rollout or a film goes on before its slot gives a sign of life."""
+
+
+@dataclass(frozen=True)
+class More:
+    """Reply in place of a result: it is under way; the same command without an argument goes on with it."""
 
 
 @dataclass(frozen=True)
@@ -63,24 +72,34 @@ class CollectServer(SlotServer):
         super().__init__(config)
         self._settings = RecorderSettings(**config.settings) if config.settings else None
         self._recording: RecordingSimulator | None = None
+        self._under_way: Iterator[Driven | Filmed | None] = iter(())
         if self._settings is not None:
             self._recording = RecordingSimulator(self._simulator, self._settings)
             self._simulator = self._recording
 
     def answer(self, command: str, argument: object = None) -> object:
         """`drive` and `film` beside the usual commands."""
-        if command == "drive":
-            return self._drive(argument)
-        if command == "film":
-            return self._film(argument)
-        return super().answer(command, argument)
+        begin = {"drive": self._drive, "film": self._film}.get(command)
+        if begin is None:
+            return super().answer(command, argument)
+        if argument is not None:
+            self._under_way = begin(argument)
+        # A watchdog that counted a whole rollout would take a slow machine for a hung simulator.
+        began = time.monotonic()
+        for result in self._under_way:
+            if result is not None:
+                return result
+            if time.monotonic() - began > REPLY_EVERY_S:
+                break
+        return More()
 
     def _reset(self, spec: EpisodeSpec) -> EpisodeStart:
         if self._recording is not None:
             self._recording.plan(spec.scenario)
         return super()._reset(spec)
 
-    def _drive(self, scenario: Scenario) -> Driven:
+    def _drive(self, scenario: Scenario) -> Iterator[Driven | None]:
+        """A rollout; yields None after each step, and at last how it ended."""
         assert self._recording is not None
         assert self._settings is not None
         simulator, task, reset = self._recording, scenario.task, scenario.reset
@@ -89,20 +108,24 @@ class CollectServer(SlotServer):
         for action in scenario.prefix:
             simulator.step(action)
         if simulator.succeeded():
-            return Driven(Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action")
+            yield Driven(Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action")
+            return
         rng = stream(self._settings.seed, "driver", task, reset, scenario.provenance["trial"])
         act = make_driver(self._settings.expert, simulator.inner, task, rng)
         for t in range(task.horizon):
             action = np.asarray(act(t), dtype=np.float64)
             if not np.isfinite(action).all():
-                return Driven(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+                yield Driven(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+                return
             simulator.step(action)
             if simulator.over:
                 solved = simulator.succeeded()
-                return Driven(Outcome.SUCCESS if solved else Outcome.HORIZON, t + 1)
-        return Driven(Outcome.HORIZON, task.horizon)
+                yield Driven(Outcome.SUCCESS if solved else Outcome.HORIZON, t + 1)
+                return
+            yield None
 
-    def _film(self, job: FilmJob) -> Filmed:
+    def _film(self, job: FilmJob) -> Iterator[Filmed | None]:
+        """A replay; yields None after each step, and at last what was seen."""
         simulator, seen, error = self._simulator, [], 0.0
         simulator.reset(job.task, job.reset)
         for t in range(len(job.actions) + 1):
@@ -112,4 +135,5 @@ class CollectServer(SlotServer):
             if t < len(job.actions):
                 seen.append(simulator.observe() if t % job.every == 0 else seen[-1])
                 simulator.step(job.actions[t])
-        return Filmed(seen, error)
+            yield None
+        yield Filmed(seen, error)

@@ -58,7 +58,13 @@ def build_parser() -> argparse.ArgumentParser:
     add("--device", help="of the policy")
     add("--rename_map", type=json.loads, default={}, help="the env's observation keys to the policy's, JSON")
     add("--part-size", type=int, default=20, help="candidates written at a time (%(default)s)")
-    add("--watchdog", type=float, default=600.0, metavar="S", help="longest a rollout may take (%(default)s)")
+    add(
+        "--watchdog",
+        type=float,
+        default=600.0,
+        metavar="S",
+        help="longest a simulator may be silent (%(default)s)",
+    )
     add("--retry-errors", action="store_true", help="roll out again what broke in an earlier run")
     add("--description", default="", help="of the dataset")
     add("--license", help="SPDX identifier of the dataset; none is assumed")

@@ -1,0 +1,443 @@
+"""Collection without LeRobot: starts, streams, records, perturbation, rules, slots, and what breaks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lerobot_roborecover.build import collect_exclusions as rules
+from lerobot_roborecover.build.candidates import PERTURBED, UNPERTURBED, UNREACHABLE, Steps
+from lerobot_roborecover.build.collect_judge import TOUCHED_TILT_DEG, Judging, scene_touched, verdict
+from lerobot_roborecover.build.collect_record import (
+    Record,
+    RecorderSettings,
+    read_record,
+    record_path,
+    rollout_id,
+)
+from lerobot_roborecover.build.collect_rollouts import Ended, RolloutBook, run_expert, twin_of
+from lerobot_roborecover.build.collect_server import SERVER, CollectServer, FilmJob, More
+from lerobot_roborecover.build.collect_starts import (
+    Starts,
+    all_tasks,
+    choose_tasks,
+    make_units,
+    parse_numbers,
+    settle_action,
+    stream,
+)
+from lerobot_roborecover.env.episode import SlotConfig
+from lerobot_roborecover.env.slots import SlotPool
+from lerobot_roborecover.scenario import Reset, ScenarioError, Task
+from lerobot_roborecover.simulators import make_simulator
+from lerobot_roborecover.simulators.limits import Workspace, limits_of
+
+TASK = Task("fake", "toy", "push-left", "push", 60)
+
+
+def units(seeds=(0, 1, 2), *, perturbed=False, tasks=("toy",), trials=1, horizon=25):
+    chosen = [replace(t, horizon=horizon) for t in choose_tasks(all_tasks("fake"), tasks)]
+    return make_units(
+        chosen, Starts(seeds=tuple(seeds), trials=trials), "expert_biased", settle_action("fake"),
+        perturbed=perturbed,
+    )  # fmt: skip
+
+
+def config(folder, seed=5):
+    settings_ = {"folder": str(folder), "seed": seed, "expert": "expert_biased", "perturbed_steps": 20}
+    return SlotConfig("fake", {}, server=SERVER, settings=settings_)
+
+
+def ask(server, command, argument):
+    """A command to its end, as the crew gives it."""
+    reply = server.answer(command, argument)
+    while isinstance(reply, More):
+        reply = server.answer(command)
+    return reply
+
+
+def contents(folder):
+    """Everything that a record holds, by rollout."""
+    found = {}
+    for path in sorted(folder.glob("*.npz")):
+        r = read_record(path)
+        found[path.stem] = [
+            r.actions.tobytes(), r.steps.perturbation.tobytes(), r.steps.solved.tobytes(),
+            *(p.tobytes() for p in r.steps.bodies.values()),
+        ]  # fmt: skip
+    return found
+
+
+# --- starts
+
+
+@given(short=st.integers(1, 30), more=st.integers(0, 30), seed=st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_a_longer_draw_begins_with_the_shorter_and_never_repeats(short, more, seed):
+    one = [r.seed for r in Starts(draw=short, seed=seed).resets(TASK)]
+    two = [r.seed for r in Starts(draw=short + more, seed=seed).resets(TASK)]
+    assert two[:short] == one
+    assert len(set(two)) == short + more
+    other = replace(TASK, name="push-right")
+    assert [r.seed for r in Starts(draw=short, seed=seed).resets(other)] != one
+
+
+@given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 20)), min_size=1, max_size=6))
+def test_numbers_are_read_as_written(ranges):
+    text = ",".join(f"{a}-{a + n}" if n else str(a) for a, n in ranges)
+    expected = [k for a, n in ranges for k in range(a, a + n + 1)]
+    if len(set(expected)) < len(expected):
+        with pytest.raises(ScenarioError, match="twice"):
+            parse_numbers(text, "--seeds")
+    else:
+        assert parse_numbers(text, "--seeds") == tuple(expected)
+
+
+@pytest.mark.parametrize("text", ["", "3-1", "a", "-4", "1.5", "0-99999999", "5000000000", "1-2-3"])
+def test_other_numbers_are_refused(text):
+    with pytest.raises(ScenarioError, match="--seeds"):
+        parse_numbers(text, "--seeds")
+
+
+def test_tasks_by_suite_name_and_pattern():
+    tasks = all_tasks("fake")
+    names = lambda *p: [t.name for t in choose_tasks(tasks, p)]  # noqa: E731
+    assert names("toy") == names("push-*") == names("toy/*") == ["push-left", "push-right"]
+    assert names("toy/push-right", "push-left", "push-left") == ["push-left", "push-right"]
+    with pytest.raises(ScenarioError, match="push-left"):
+        names("push-lefd")
+    with pytest.raises(ScenarioError, match="--task"):
+        names()
+
+
+@pytest.mark.parametrize(
+    ("starts", "message"),
+    [
+        ({}, "none of them"),
+        ({"seeds": (1,), "draw": 3}, "seeds and draw"),
+        ({"draw": 3, "trials": 0}, "--trials"),
+    ],
+)
+def test_starts_that_say_nothing_or_too_much(starts, message):
+    with pytest.raises(ScenarioError, match=message):
+        Starts(**starts)
+
+
+def test_each_platform_has_its_own_starts():
+    with pytest.raises(ScenarioError, match="--seeds or --draw"):
+        Starts(init_states=(0,)).resets(TASK)
+
+
+def test_ids_are_unique_and_fit_whatever_drives():
+    made = units(range(4), trials=3)
+    assert len({u.id for u in made}) == 2 * 4 * 3
+    name = "org/a checkpoint of a very long name, indeed longer than an id may be, " * 3
+    ids = [
+        make_units([TASK], Starts(seeds=(4,)), n, np.zeros(2), perturbed=True)[0].id
+        for n in (name, name + "x", "org/a", "org-a")
+    ]
+    assert len(set(ids)) == 4
+    assert all(len(i) <= 128 for i in ids)
+
+
+# --- records
+
+
+@given(order=st.permutations(range(6)), split=st.integers(0, 6))
+@settings(max_examples=8, deadline=None)
+def test_a_rollout_depends_on_its_start_alone(order, split, tmp_path_factory):
+    """Whichever server drives it, after whichever others."""
+    made = units((0, 1, 2), perturbed=True)
+    folders = [tmp_path_factory.mktemp("records") for _ in range(2)]
+    one = CollectServer(config(folders[0]))
+    for scenario in made:
+        ask(one, "drive", scenario)
+    servers = [CollectServer(config(folders[1])) for _ in range(2)]
+    for place, index in enumerate(order):
+        ask(servers[place >= split], "drive", made[index])
+    assert contents(folders[0]) == contents(folders[1])
+    assert len(contents(folders[0])) == 6
+
+
+def test_perturbation_is_the_papers_and_stops_where_the_platform_cannot_follow(tmp_path):
+    (scenario,) = (u for u in units((3,), perturbed=True) if u.task.name == "push-left")
+    near_wall = np.array([0.9, 0.0])  # the mass runs into a wall: some perturbed commands lead through it
+
+    class Straight:
+        def __call__(self, _t):
+            return near_wall
+
+    import lerobot_roborecover.build.collect_server as server
+
+    original = server.make_driver
+    server.make_driver = lambda *_: Straight()
+    try:
+        ask(CollectServer(config(tmp_path)), "drive", replace(scenario, task=replace(TASK, horizon=60)))
+    finally:
+        server.make_driver = original
+    record = read_record(record_path(tmp_path, scenario.id))
+    settle = scenario.reset.settle_steps
+    noise = stream(5, "perturbation", TASK, scenario.reset, 0)
+    simulator = make_simulator("fake")
+    simulator.reset(TASK, record.reset)
+    flags = []
+    for t, (action, flag) in enumerate(zip(record.actions, record.steps.perturbation, strict=True)):
+        given_ = np.zeros(2) if t < settle else near_wall
+        if settle <= t < settle + 20:
+            noisy = given_ + noise.uniform(-1, 1, 3)[:2]
+            reachable = simulator.reachable(noisy)
+            assert flag == (PERTURBED if reachable else UNREACHABLE)
+            assert np.array_equal(action, noisy if reachable else given_)
+        else:
+            assert flag == UNPERTURBED
+            assert np.array_equal(action, given_)
+        simulator.step(action)
+        flags.append(int(flag))
+    assert flags.count(PERTURBED) > 5
+    twin = twin_of(scenario)
+    ask(CollectServer(config(tmp_path)), "drive", twin)
+    assert not read_record(record_path(tmp_path, rollout_id(twin, twin=True))).steps.perturbation.any()
+
+
+def test_reach_decides_at_the_walls():
+    simulator = make_simulator("fake")
+    simulator.reset(TASK, Reset(seed=0))
+    assert limits_of(simulator) is simulator
+    assert simulator.reachable(np.array([1.0, 0.0]))
+    for _ in range(200):
+        simulator.step(np.array([1.0, 0.0]))
+    assert not simulator.reachable(np.array([1.0, 0.0]))
+    assert simulator.reachable(np.array([-1.0, 0.0]))
+
+
+def test_a_film_is_compared_with_the_rollout(tmp_path):
+    server = CollectServer(config(tmp_path))
+    scenario = units((0,))[0]
+    ask(server, "drive", scenario)
+    record = read_record(record_path(tmp_path, scenario.id))
+    poses = np.stack(list(record.steps.bodies.values()))
+    job = FilmJob(scenario.task, record.reset, record.actions, tuple(record.steps.bodies), poses)
+    plain = CollectServer(SlotConfig("fake", {}, server=SERVER))
+    film = ask(plain, "film", job)
+    assert film.error_m == 0.0
+    assert len(film.observations) == len(record.actions)
+    assert np.array_equal(film.observations[-1]["agent_pos"][:2], record.steps.bodies["eef"][-2, :2])
+    shifted = poses.copy()
+    shifted[0, 7, 1] += 0.01
+    assert ask(plain, "film", replace(job, poses=shifted)).error_m == pytest.approx(0.01)
+
+
+def test_damaged_records_say_so(tmp_path):
+    path = record_path(tmp_path, "one")
+    with pytest.raises(ScenarioError, match="Delete it"):
+        read_record(path)
+    path.write_bytes(b"PK\x03\x04 not a record")
+    with pytest.raises(ScenarioError, match="Delete it"):
+        read_record(path)
+
+
+# --- slots
+
+
+def roll(work, made, slots, stop_after=None):
+    """Rolls out in worker processes; as collect does, but for LeRobot."""
+    book = RolloutBook(work)
+    ended = []
+
+    def on_end(end):
+        book.add(end)
+        ended.append(end.rollout)
+        if stop_after is not None and len(ended) == stop_after:
+            raise KeyboardInterrupt
+
+    pool = SlotPool(config(book.records), workers=True, timeout_s=20)
+    pool.acquire()
+    try:
+        run_expert([u for u in made if book.find(u.id) is None], pool, slots, on_end)
+    finally:
+        pool.release()
+        book.close()
+    return ended
+
+
+def test_slots_and_interruption_change_nothing(tmp_path):
+    made = units(range(3), perturbed=True)
+    roll(tmp_path / "one", made, 1)
+    with pytest.raises(KeyboardInterrupt):
+        roll(tmp_path / "two", made, 2, stop_after=2)
+    rest = roll(tmp_path / "two", list(reversed(made)), 2)
+    assert len(rest) == 4  # what had ended was not run again
+    assert contents(tmp_path / "one" / "rollouts") == contents(tmp_path / "two" / "rollouts")
+
+
+def test_a_breaking_simulator_costs_its_rollout_alone(tmp_path):
+    made = [*units((0,), tasks=("faults/raises", "faults/exits"), horizon=30), *units((0,))]
+    ended = roll(tmp_path, made, 1)
+    assert len(ended) == len(made)
+    book = RolloutBook(tmp_path)
+    try:
+        outcomes = {u.task.name: book.find(u.id).outcome for u in made}
+        assert outcomes["raises"] == outcomes["exits"] == "sim_error"
+        assert outcomes["push-left"] in ("success", "horizon")
+        broken = next(u for u in made if u.task.name == "raises")
+        found = verdict(broken, book.find(broken.id), book, Judging())
+        assert found.dropped.reason == "not run to its end: sim_error"
+        assert "on purpose" in found.dropped.detail
+        assert book.find(broken.id, retry_errors=True) is None
+        whole = next(u for u in made if u.task.name == "push-left")
+        record_path(book.records, whole.id).unlink()
+        assert book.find(whole.id) is None  # without its record it is run again
+    finally:
+        book.close()
+
+
+def test_the_journal_is_one_process_own(tmp_path):
+    book = RolloutBook(tmp_path)
+    with pytest.raises(ScenarioError, match="another process"):
+        RolloutBook(tmp_path)
+    book.add(Ended("a", "success", 3))
+    book.close()
+    (tmp_path / "rollouts.jsonl").open("a").write('{"schema": 1, "rollout": "b", "outcome": "won"}\n')
+    with pytest.raises(ScenarioError, match="not a rollout's end"):
+        RolloutBook(tmp_path)
+
+
+# --- rules
+
+
+def record_of(path, *, puck=None, actions=None, margin=None, flags=None, settle=2):
+    """A record whose end effector follows a path, (T + 1, 3)."""
+    path = np.asarray(path, dtype=np.float64)
+    count = len(path) - 1
+    puck = np.zeros((count + 1, 3)) if puck is None else np.asarray(puck, dtype=np.float64)
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (count + 1, 1))
+    bodies = {
+        "eef": np.hstack([path, upright]), "puck": np.hstack([puck, upright]),
+        "puck.handle": np.hstack([puck - 9, upright]), "goal": np.hstack([puck - 9, upright]),
+    }  # fmt: skip
+    return Record(
+        Reset(seed=0, settle_steps=settle),
+        np.zeros((count, 4)) if actions is None else actions,
+        Steps(bodies, np.zeros(count + 1, bool), np.zeros(count, np.int8) if flags is None else flags),
+        np.full(count + 1, np.inf) if margin is None else margin,
+        Workspace((-1, -1, -1), (1, 1, 1), 0.0),
+    )
+
+
+def line(count=202, step=0.004):
+    """A smooth way out and back, 1 mm to 4 mm a step."""
+    t = np.arange(count)
+    return np.stack([0.2 * np.sin(t * step / 0.2), np.zeros(count), np.zeros(count)], axis=1)
+
+
+def test_an_ordinary_rollout_passes():
+    assert rules.judge(record_of(line())) is None
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_erratic_motion(share):
+    sign = (
+        np.where(np.arange(201) % round(1 / share * 2) < 2, -1, 1) if share < 0.5 else (-1) ** np.arange(201)
+    )
+    path = np.concatenate([[[0, 0, 0]], np.cumsum(sign[:, None] * [[0.004, 0, 0]], axis=0)])
+    found = rules.judge(record_of(path), only=("erratic",))
+    assert (found is not None) == (share == 0.5)
+    shaken = np.full(201, PERTURBED, np.int8)  # noise on purpose is nobody's fault
+    assert rules.judge(record_of(path, flags=shaken), only=("erratic",)) is None
+
+
+@pytest.mark.parametrize(("steps", "out"), [(rules.OUTSIDE_STEPS - 1, False), (rules.OUTSIDE_STEPS, True)])
+def test_out_of_region(steps, out):
+    path = line()
+    path[50 : 50 + steps, 1] = 1.0 + rules.OUTSIDE_M + 0.001
+    found = rules.judge(record_of(path))
+    assert (found is not None and found.rule == "outside") == out
+    if out:
+        assert f"{steps} steps" in found.detail
+
+
+@pytest.mark.parametrize(
+    ("depth", "out"), [(-rules.FALLEN_M + 0.001, False), (-rules.FALLEN_M - 0.001, True)]
+)
+def test_off_the_table(depth, out):
+    puck = np.zeros((202, 3))
+    puck[120:, 2] = depth
+    found = rules.judge(record_of(line(), puck=puck))
+    assert (found is not None and found.rule == "fallen") == out
+    if out:
+        assert "from step 120" in found.detail
+        assert rules.judge(record_of(line(), puck=puck), skip=("fallen",)) is None
+    under = np.full((202, 3), -0.5)  # a drawer's box, say, that belongs there
+    assert rules.judge(record_of(line(), puck=under)) is None
+
+
+def test_irreversible_is_moved_at_rest_and_out_of_reach():
+    puck = np.zeros((202, 3))
+    puck[60:, 0] = 1.0 + rules.OUT_OF_REACH_M + 0.01
+    found = rules.judge(record_of(line(), puck=puck))
+    assert found.rule == "irreversible"
+    rolling = puck.copy()
+    rolling[-20:, 0] += np.arange(20) * 0.01
+    assert rules.judge(record_of(line(), puck=rolling)) is None
+    beyond = np.zeros((202, 3))
+    beyond[:, 0] = 1.2  # there from the start
+    assert rules.judge(record_of(line(), puck=beyond)) is None
+
+
+@pytest.mark.parametrize(("steps", "out"), [(rules.LIMIT_STEPS - 1, False), (rules.LIMIT_STEPS, True)])
+def test_stuck_at_a_joint_limit(steps, out):
+    path, margin = line(), np.full(202, 0.5)
+    path[-steps - 30 :] = path[-1]
+    margin[-steps:] = 0.0
+    found = rules.judge(record_of(path, margin=margin))
+    assert (found is not None and found.rule == "joint-limit") == out
+    moving = rules.judge(record_of(line(), margin=margin))
+    assert moving is None
+    unknown = rules.judge(record_of(path, margin=np.full(202, np.nan)))
+    assert unknown is None
+
+
+@pytest.mark.parametrize(("moves", "out"), [(0.25, False), (0.15, True)])
+def test_pressing_without_moving(moves, out):
+    path = line()
+    path[round(2 + 199 * moves) :] = path[round(2 + 199 * moves)] + [0.0, 0.5, 0.0]
+    actions = np.tile([0.0, 0.0, -1.0, 0.0], (201, 1))
+    found = rules.judge(record_of(path, actions=actions))
+    assert (found is not None and found.rule == "pressing") == out
+    assert rules.judge(record_of(path)) is None  # nobody tells it to move
+
+
+def test_rules_are_known_by_name():
+    with pytest.raises(ScenarioError, match="erratic"):
+        rules.check_rules("--no-exclude", ["jerk"])
+    rules.check_rules("--no-exclude", list(rules.RULES))
+
+
+# --- what a disturbance touched
+
+
+def test_touched_is_what_ends_off_its_undisturbed_path():
+    carried = np.zeros((202, 3))
+    carried[100:, 0] = np.linspace(0, 0.3, 102)
+    twin = record_of(line(), puck=carried)
+    left = np.zeros((202, 3))  # missed: where it was, which the twin's path begins with
+    assert scene_touched(record_of(line(), puck=left), twin).displaced_mm == 0
+    let_go = carried.copy()
+    let_go[150:] = [carried[150, 0], 0.0, 0.0]  # somewhere on its path
+    assert scene_touched(record_of(line(), puck=let_go), twin).displaced_mm == 0
+    aside = carried.copy()
+    aside[150:] = [carried[150, 0], 0.04, 0.0]
+    touch = scene_touched(record_of(line(), puck=aside), twin)
+    assert (touch.body, touch.displaced_mm) == ("puck", pytest.approx(40))
+    tipped = record_of(line(), puck=left)
+    angle = np.radians(TOUCHED_TILT_DEG + 5)
+    tipped.steps.bodies["puck"][-1, 3:] = [np.sin(angle / 2), 0, 0, np.cos(angle / 2)]
+    assert scene_touched(tipped, twin).tilted_deg == pytest.approx(TOUCHED_TILT_DEG + 5)
+
+
+def test_settings_are_plain_values():
+    assert RecorderSettings("x").perturbed_steps == 150  # the paper's

@@ -1,0 +1,218 @@
+"""`roborecover collect` as a whole: datasets, resumption, policies, refusals; and the real simulators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from factories import save_policy
+
+from lerobot_roborecover.build.candidates import PERTURBED, UNREACHABLE, read_candidates
+from lerobot_roborecover.build.collect_record import read_record
+from lerobot_roborecover.build.funnel import funnel, read_decisions
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.scenario import Reset, Task
+from lerobot_roborecover.simulators import make_simulator
+
+FAKE = ["collect", "--env.type=roborecover_fake", "--task=toy", "--horizon=25", "--slots=2"]
+
+
+def arguments(out, *more):
+    return [*FAKE, f"--out={out}", *more]
+
+
+def meaning(root):
+    """What a collection holds, times left out."""
+    found = read_candidates(root)
+    decisions = [(d.candidate, d.verdict, d.reason, d.detail, d.by) for d in read_decisions(root)]
+    steps = [found.steps(i) for i in range(len(found))]
+    return (
+        found.candidates,
+        found.trajectories.rows,
+        [found.actions(i).tobytes() for i in range(len(found))],
+        [[p.tobytes() for p in s.bodies.values()] + [s.perturbation.tobytes()] for s in steps],
+        sorted(decisions),
+    )
+
+
+@pytest.mark.lerobot
+def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypatch, capsys):
+    perturbed = ["--expert=expert_biased", "--seeds=0-3", "--perturb", "--frames=32", "--part-size=3"]
+    assert main(arguments(tmp_path / "one", *perturbed)) == 0
+    table = capsys.readouterr().out
+    found = read_candidates(tmp_path / "one")
+    assert f"{len(found)} candidates in" in table
+    (row,) = funnel(read_decisions(tmp_path / "one"))
+    assert row.entered == 8  # every rollout is accounted for
+    assert not any(found.steps(i).solved.any() for i in range(len(found)))
+    assert {c.source for c in found.candidates} == {"perturbed"}
+    assert (found.steps(0).perturbation == PERTURBED).sum() > 10
+
+    from lerobot_roborecover.build import collect_write
+
+    original, written = collect_write.write_candidates, []
+
+    def stops(root, *args, **kwargs):
+        if written:
+            raise KeyboardInterrupt
+        written.append(root)
+        return original(root, *args, **kwargs)
+
+    monkeypatch.setattr(collect_write, "write_candidates", stops)
+    assert main(arguments(tmp_path / "two", *perturbed, "--slots=1")) == 130
+    assert not (tmp_path / "two").exists()
+    monkeypatch.setattr(
+        collect_write,
+        "write_candidates",
+        lambda root, *a, **k: written.append(root) or original(root, *a, **k),
+    )
+    assert main(arguments(tmp_path / "two", *perturbed, "--slots=1")) == 0
+    assert len(set(written)) == len(written)  # a part that was there is not filmed again
+    assert meaning(tmp_path / "one") == meaning(tmp_path / "two")
+
+    # It is finished, and another one is refused with what differs.
+    assert main(arguments(tmp_path / "one", *perturbed)) == 0
+    assert "finished already" in capsys.readouterr().err
+    assert main(arguments(tmp_path / "one", *perturbed, "--seed=8")) == 2
+    assert "seed 7, now 8" in capsys.readouterr().err
+    assert main(arguments(tmp_path / "three", *perturbed, f"--work={tmp_path / 'one.work'}", "--seed=8")) == 2
+    assert "holds rollouts with other options (seed 7, now 8)" in capsys.readouterr().err
+    touched = [*perturbed, f"--work={tmp_path / 'one.work'}", "--scene-touched=15"]
+    assert main(arguments(tmp_path / "touched", *touched)) in (0, 1)
+    assert "the disturbance did not touch the scene" in capsys.readouterr().out
+
+
+@pytest.mark.lerobot
+def test_a_policy_collects_the_same_whatever_the_slots(tmp_path, capsys):
+    policy = save_policy(tmp_path / "act")
+    common = [f"--policy.path={policy}", "--seeds=0-3", "--frames=none", "--env.obs_type=state"]
+    assert main(arguments(tmp_path / "one", *common, "--slots=1")) == 0
+    assert main(arguments(tmp_path / "three", *common, "--slots=3")) == 0
+    assert meaning(tmp_path / "one") == meaning(tmp_path / "three")
+    found = read_candidates(tmp_path / "one")
+    assert {c.source for c in found.candidates} == {"natural"}
+    assert found.row(0).driver.startswith("act@")
+    # Exact: the simulator that is given the stored actions is where the rollout was.
+    simulator = make_simulator("fake")
+    simulator.reset(found.row(0).task_record(), found.row(0).reset_record())
+    for action in found.actions(0):
+        simulator.step(action)
+    assert simulator.bodies() == found.steps(0).poses_at(found.row(0).steps)
+    wide = save_policy(tmp_path / "wide", action=7)
+    capsys.readouterr()
+    assert (
+        main(arguments(tmp_path / "wide-out", f"--policy.path={wide}", "--seeds=0", "--env.obs_type=state"))
+        == 2
+    )
+    assert "7 values" in capsys.readouterr().err
+
+
+@pytest.mark.lerobot
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--seeds=0"], "who drives"),
+        (["--seeds=0", "--expert=expert", "--policy.path=x"], "not both"),
+        (["--expert=exprt", "--seeds=0"], "pushes the puck"),
+        (["--expert=expert"], "--seeds 0-29"),
+        (["--expert=expert", "--seeds=0", "--draw=2"], "seeds and draw"),
+        (["--expert=expert", "--init-states=0"], "no stored init states"),
+        (["--expert=expert", "--seeds=0", "--task=push-lefd"], "push-left"),
+        (["--expert=expert", "--seeds=0", "--frames=9"], "16 to 2048"),
+        (["--expert=expert", "--seeds=0", "--scene-touched=5"], "--perturb"),
+        (["--expert=expert", "--seeds=0", "--no-exclude=jerk"], "erratic"),
+        (["--expert=expert", "--seeds=0", "--env.control=3"], "control"),
+        (["--policy.path=/nowhere", "--seeds=0"], "/nowhere"),
+        (["--expert=expert", "--seeds=0", "--env.type=pusht"], "--env.type=pusht"),
+    ],
+)  # fmt: skip
+def test_refusals_come_before_any_simulator(tmp_path, capsys, monkeypatch, more, message):
+    from lerobot_roborecover.env import slots
+
+    monkeypatch.setattr(slots, "WorkerSlot", lambda *_: pytest.fail("a simulator was started"))
+    try:
+        status = main(arguments(tmp_path / "out", *more))
+    except SystemExit as err:
+        status = err.code
+    assert status == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.lerobot
+def test_something_else_in_the_folder_is_left_alone(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(arguments(tmp_path, "--expert=expert", "--seeds=0")) == 2
+    assert "something other than a collection" in capsys.readouterr().err
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.metaworld
+def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
+    from test_collect import ask
+
+    from lerobot_roborecover.build.collect_server import CollectServer, FilmJob
+    from lerobot_roborecover.build.collect_starts import Starts, all_tasks, choose_tasks, make_units
+    from lerobot_roborecover.env.episode import SlotConfig
+
+    tasks = choose_tasks(all_tasks("metaworld"), ["reach-wall-v3", "push-v3"])
+    made = make_units(tasks, Starts(seeds=(0,)), "expert_biased", np.zeros(4), perturbed=True)
+    settings = {"folder": str(tmp_path), "seed": 7, "expert": "expert_biased"}
+    server = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}, settings=settings))
+    film = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}))
+    flags = set()
+    for scenario in made:
+        ended = ask(server, "drive", scenario)
+        record = read_record(tmp_path / f"{scenario.id}.npz")
+        assert len(record.actions) == ended.steps
+        flags |= set(record.steps.perturbation[:150].tolist())
+        poses = np.stack(list(record.steps.bodies.values()))
+        job = FilmJob(scenario.task, record.reset, record.actions, tuple(record.steps.bodies), poses)
+        assert ask(film, "film", job).error_m == 0.0
+        box = record.workspace
+        inside = record.actions[record.steps.perturbation == PERTURBED]
+        assert len(inside)
+        assert box.low_m[0] == -0.5
+    assert flags == {PERTURBED, UNREACHABLE}
+
+
+@pytest.mark.metaworld
+def test_metaworld_reach_is_where_the_hand_is_stopped():
+    simulator = make_simulator("metaworld", obs_type="state")
+    task = Task("metaworld", "easy", "reach-v3", "reach", 500)
+    simulator.reset(task, Reset(seed=0))
+    up, before = np.array([0.0, 0.0, 1.0, 0.0]), simulator.state_sha256()
+    assert simulator.reachable(up)
+    assert simulator.reachable(5 * up)  # clipped: the input's range is no limit of reach
+    assert simulator.state_sha256() == before
+    for _ in range(60):
+        simulator.step(up)
+    assert not simulator.reachable(up)
+    assert simulator.reachable(-up)
+
+
+@pytest.mark.libero
+def test_libero_reach_ends_with_the_arm_and_changes_nothing():
+    simulator = make_simulator("libero", obs_type="state")
+    task = Task("libero", "libero_goal", "put_the_bowl_on_the_plate", "put the bowl on the plate", 300)
+    simulator.reset(task, Reset(seed=7, init_state_index=0))
+    before = simulator.state_sha256()
+    rng = np.random.default_rng(0)
+    assert all(simulator.reachable(np.array([*rng.uniform(-1, 1, 3), 0, 0, 0, -1])) for _ in range(20))
+    assert simulator.joint_margin_rad() > 0.3
+    assert simulator.state_sha256() == before
+    away = np.array([1.0, 1.0, -0.3, 0, 0, 0, -1])
+    for _ in range(40):
+        simulator.step(away)
+    assert not simulator.reachable(away)
+    assert simulator.reachable(-away)
+    box = simulator.workspace()
+    assert box.low_m[:2] == (-0.5, -0.6)  # LIBERO's kitchen table
+    assert box.support_m == 0.9
+
+
+@pytest.mark.lerobot
+def test_a_dry_run_lists_the_rollouts(tmp_path, capsys):
+    assert main([*FAKE, f"--out={tmp_path / 'x'}", "--expert=expert", "--draw=2", "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "4 rollouts; dry run: nothing was run"
+    assert not (tmp_path / "x.work").exists()
