@@ -205,19 +205,18 @@ def nearly(hand: Hand) -> None:
     """Brings the object close to its place, and stops beside it."""
 
     def near() -> bool:
-        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.13)
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
 
     hand.grasp()
     hand.carry(near)
-    spot = hand.goal() + hand.sideways(0.05, 0.075) + (hand.at() - hand.object())
-    hand.go(np.array([*spot[:2], hand.at()[2]]), CLOSED, 30)
+    hand.go(hand.at() + hand.sideways(0.02, 0.03), CLOSED, 15)
 
 
 def fallen_beside(hand: Hand) -> None:
     """Lets the object fall just before its place, and rises."""
 
     def near() -> bool:
-        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.11)
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
 
     hand.grasp()
     hand.carry(near)
