@@ -39,6 +39,7 @@ FILM_EVERY = 16
 """Steps from one picture of the dataset to the next: software rendering is slow."""
 START_S = 300.0
 _ATTEMPT_SEEDS = (1, 2)
+_ERROR = "error: "
 
 
 class Remote:
@@ -168,6 +169,8 @@ def _address(lines: Connection) -> str:
         line = _line(lines)
         if line is None:
             break
+        if line.startswith(_ERROR):
+            raise ScenarioError(line.removeprefix(_ERROR))
         if "http://" in line:
             return line.split()[-1]
     raise ScenarioError("the teleoperation server did not start")
@@ -189,7 +192,7 @@ def _serve(config: TeleopConfig, said: Connection) -> None:
     try:
         serve(config, said.send)
     except (ScenarioError, KeyboardInterrupt) as err:
-        said.send(f"error: {err}")
+        said.send(f"{_ERROR}{err}")
 
 
 def main() -> None:
