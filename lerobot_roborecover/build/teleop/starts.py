@@ -47,15 +47,15 @@ def numbers(text: str, option: str) -> list[int]:
         ScenarioError: it is no such list; names the option.
     """
     found: list[int] = []
-    try:
-        for part in text.split(","):
-            first, _, last = part.strip().partition("-")
-            found += range(int(first), int(last or first) + 1)
-            if len(found) > MAX_STARTS:
-                raise ScenarioError(f"{option} lists more than {MAX_STARTS} numbers")
-    except ValueError:
-        raise ScenarioError(f"{option} {text!r:.80} is not a list of numbers like 0-9,12") from None
-    if not found or min(found) < 0 or max(found) >= 2**32:
+    for part in text.split(","):
+        first, _, last = (piece.strip() for piece in part.partition("-"))
+        if not first.isdecimal() or not (last or first).isdecimal():
+            raise ScenarioError(f"{option} {text!r:.80} is not a list of numbers like 0-9,12")
+        span = range(int(first), int(last or first) + 1)
+        if len(found) + len(span) > MAX_STARTS:
+            raise ScenarioError(f"{option} lists more than {MAX_STARTS} numbers")
+        found += span
+    if not found or max(found) >= 2**32:
         raise ScenarioError(f"{option} {text!r:.80} names no numbers from 0 to 2^32 - 1")
     return list(dict.fromkeys(found))
 

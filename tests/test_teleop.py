@@ -1,0 +1,503 @@
+"""Teleoperation below the page: what is recorded is what happened, and nothing sent breaks the server."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from contextlib import contextmanager
+
+import httpx
+import numpy as np
+import pytest
+from candidate_files import candidate_dataset
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from teleop_sessions import push
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from lerobot_roborecover.build.candidates import read_candidates
+from lerobot_roborecover.build.funnel import Decision, read_decisions, record_decisions
+from lerobot_roborecover.build.teleop.client import Client, TeleopRefusal
+from lerobot_roborecover.build.teleop.controls import AXES, controls_of
+from lerobot_roborecover.build.teleop.desk import Desk
+from lerobot_roborecover.build.teleop.hub import Hub
+from lerobot_roborecover.build.teleop.pilot import Command, Pilot, Tick
+from lerobot_roborecover.build.teleop.server import Cockpit, make_app
+from lerobot_roborecover.build.teleop.session import Session
+from lerobot_roborecover.build.teleop.spacemouse import Reports, SpaceMouse
+from lerobot_roborecover.build.teleop.starts import continued, first_state, first_states
+from lerobot_roborecover.build.teleop.store import Store, read_recording
+from lerobot_roborecover.build.teleop.write import check_open, recordings_folder, write_dataset
+from lerobot_roborecover.build.web.serve import MAX_SOCKET_MESSAGE_BYTES, listen, make_server
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.simulators import make_simulator
+
+TOKEN = "t" * 32
+
+
+@contextmanager
+def cockpit(folder, starts=(), platform="fake"):
+    """Server and simulator in threads of this process; yields the page's address."""
+    store, hub = Store(folder), Hub()
+    desk = Desk(lambda: make_simulator(platform), "ann", starts, store, hub)
+    desk.start()
+    desk.ready.wait()
+    listener = listen(0)
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    server = make_server(make_app(Cockpit(TOKEN, frozenset({host}), hub, desk.pilot)))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield f"http://{host}/drive/?token={TOKEN}"
+    finally:
+        server.should_exit = True
+        thread.join()
+        desk.stop()
+        desk.join()
+        store.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    with cockpit(tmp_path_factory.mktemp("r") / "set.recordings") as found:
+        yield found
+
+
+# --- what is recorded
+
+
+def states(simulator, start, actions) -> list[str]:
+    simulator.reset(start.task, start.reset)
+    found = [simulator.state_sha256()]
+    for action in actions:
+        simulator.step(action)
+        found.append(simulator.state_sha256())
+    return found
+
+
+def check_exact(platform, task, moves, width, **options) -> None:
+    """Drives and takes back at random; what is left must be what its actions alone give."""
+    simulator, start = make_simulator(platform, **options), first_state(platform, task, seed=5)
+    session = Session(simulator, "ann")
+    session.start(start)
+    rng = np.random.default_rng(len(moves))
+    for move in moves:
+        if move > 0:
+            for _ in range(move):
+                session.act(rng.uniform(-1, 1, width), "script")
+        else:
+            session.back(-move)
+    assert len(session.bodies) == len(session.solved) == session.step + 1
+    assert states(make_simulator(platform, **options), start, session.actions)[-1] == simulator.state_sha256()
+    assert session.bodies[-1] == simulator.bodies()
+    if session.step:
+        session.back(1)
+        session.act(last := rng.uniform(-1, 1, width), "script")
+        again = states(make_simulator(platform, **options), start, [*session.actions[:-1], last])
+        assert again[-1] == simulator.state_sha256()
+    simulator.close()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(-30, 30).filter(bool), max_size=8))
+def test_steps_taken_back_never_happened(moves):
+    check_exact("fake", "push-left", moves, 2)
+
+
+@pytest.mark.metaworld
+def test_steps_taken_back_never_happened_on_metaworld():
+    check_exact("metaworld", "push-v3", [25, -10, 230, -3, 5, -210, 4], 4, obs_type="state")
+
+
+def test_a_mark_needs_a_deviation_and_goes_with_the_steps_before_it(address):
+    with Client(address) as client:
+        client.start("push-left", seed=3)
+        with pytest.raises(TeleopRefusal, match="nothing has happened yet"):
+            client.mark()
+        client.act(np.full((12, 2), 0.1))
+        with pytest.raises(TeleopRefusal, match="must be empty or one of Approach"):
+            client.mark("Grasp")
+        assert client.mark("Contact", "Wrong Pose")["mark"] == [12, "Contact", "Wrong Pose"]
+        client.act([0.1, 0.1])
+        assert client.back(1)["mark"] == [12, "Contact", "Wrong Pose"]
+        assert client.back(1)["mark"] is None
+        assert client.back(500)["step"] == 0
+        with pytest.raises(TeleopRefusal, match="nothing was driven"):
+            client.finish(as_dropped=True)
+        client.act([0.1, 0.1])
+        with pytest.raises(TeleopRefusal, match="a recording is under way"):
+            client.start("push-left")
+        with pytest.raises(TeleopRefusal, match="no recovery point marked"):
+            client.finish()
+        push(client)
+        with pytest.raises(TeleopRefusal, match="nothing to recover from"):
+            client.mark()
+        client.discard()
+        with pytest.raises(TeleopRefusal, match="start a task first"):
+            client.act([0, 0])
+        with pytest.raises(TeleopRefusal, match="fake has no task"):
+            client.start("../push")
+
+
+def test_a_script_records_what_it_sent_bit_for_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    sent = rng.uniform(-1, 1, (9, 2))
+    with cockpit(tmp_path / "set.recordings") as found, Client(found) as client:
+        client.start("push-left", seed=4)
+        client.act(sent[0])
+        client.act(sent[1:])
+        client.mark()
+        push(client)
+        name = client.finish()
+    (path,) = (tmp_path / "set.recordings").glob("recording-*.npz")
+    saved = read_recording(path)
+    assert (saved.id, saved.operator, saved.mark) == (name, "ann", (9, "", ""))
+    assert saved.actions[:9].tobytes() == sent.tobytes()
+    assert saved.lacks == ""
+    assert saved.solved[-1]
+    assert saved.notes["recovery_steps"] == len(saved.actions) - 9
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ScenarioError, match="not a whole recording"):
+        read_recording(path)
+
+
+def test_one_process_holds_a_datasets_recordings(tmp_path):
+    first = Store(tmp_path / "r")
+    with pytest.raises(ScenarioError, match="in use by another"):
+        Store(tmp_path / "r")
+    first.close()
+    Store(tmp_path / "r").close()
+
+
+def test_a_rollout_is_continued_from_any_of_its_steps(tmp_path):
+    dataset = candidate_dataset(tmp_path / "natural", 2)
+    start = continued(dataset, "ep-0001", 20)
+    session = Session(make_simulator("fake"), "ann")
+    session.start(start)
+    assert session.step == 20
+    recorded = read_candidates(dataset).steps(1).bodies["puck"][20, :3]
+    assert session.bodies[-1]["puck"].position_m == tuple(recorded)
+    session.act(np.array([1.0, 0.0]), "script")
+    assert session.back(50) == 1, "what came before was not driven here"
+    session.act(np.array([1.0, 0.0]), "script")
+    saved = session.recorded("x", as_dropped=True)
+    assert saved.source_record == "ep-0001"
+    assert saved.notes["continues"] == {
+        "dataset": "natural", "candidate": "ep-0001", "step": 20, "driver": "noise",
+    }  # fmt: skip
+    for name, step, message in (("ep-9", 20, "no candidate"), ("ep-0001", 46, "steps 2 to 45")):
+        with pytest.raises(ScenarioError, match=message):
+            continued(dataset, name, step)
+
+
+@pytest.mark.lerobot
+def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_path):
+    out, said = tmp_path / "set", []
+    folder = recordings_folder(out)
+    options = ("fake", {}, 32, said.append)
+    check_open(out)
+    with cockpit(folder) as found, Client(found) as client:
+        client.start("push-left", seed=4)
+        client.act(np.full((5, 2), 0.5))
+        client.mark("Approach", "Wrong Pose")
+        push(client)
+        good = client.finish()
+        client.start("push-left", seed=6)
+        client.act(np.full((5, 2), 0.5))
+        client.mark()
+        bad = client.finish(as_dropped=True)
+    store = Store(folder)
+    assert write_dataset(out, store, *options)
+    made = read_candidates(out)
+    assert [c.id for c in made.candidates] == [good, bad]
+    assert {c.source.value for c in made.candidates} == {"human"}
+    assert [(s.step, s.by, s.stage) for s in made.candidates[0].suggestions] == [(5, "operator", "Approach")]
+    assert made.row(0).driver == "ann"
+    saved = read_recording(store.paths()[0])
+    assert made.actions(0).tobytes() == saved.actions.tobytes()
+    assert (made.steps(0).bodies["puck"] == saved.bodies["puck"]).all()
+    decided = [(d.candidate, d.verdict, d.reason) for d in read_decisions(out)]
+    assert decided == [(good, "kept", ""), (bad, "dropped", "not solved after the mark")]
+    store.close()
+    # A later session adds to it; a recording that does not replay is dropped with the distance.
+    with cockpit(folder) as found, Client(found) as client:
+        client.start("push-left", seed=7)
+        client.act(np.full((5, 2), 0.5))
+        client.mark()
+        push(client)
+        client.finish()
+    store = Store(folder)
+    path = store.paths()[2]
+    kept = read_recording(path)
+    kept.bodies["puck"][3, 0] += 0.01
+    store.add(kept, 3)
+    assert write_dataset(out, store, *options)
+    assert read_decisions(out)[-1].reason == "does not replay"
+    assert read_decisions(out)[-1].detail.startswith("10 mm off")
+    assert len(read_candidates(out)) == 3
+    assert [p.name for p in sorted(folder.glob("part-*"))] == ["part-000001-000003"]
+    record_decisions(out, [Decision(good, "screen", "kept")])
+    for refused in (lambda: check_open(out), lambda: write_dataset(out, store, *options)):
+        with pytest.raises(ScenarioError, match="being worked on"):
+            refused()
+    store.close()
+
+
+# --- who may ask, and for what
+
+
+def socket_address(address: str, query: str = f"?token={TOKEN}") -> str:
+    return address.replace("http://", "ws://").split("?")[0] + "socket" + query
+
+
+def test_only_the_page_with_the_token_gets_in(address):
+    base, host = address.split("?")[0], address.split("/")[2]
+    with httpx.Client(trust_env=False) as client:
+        assert client.get(base).status_code == 403
+        assert client.get(f"{base}?token={'x' * 32}").status_code == 403
+        assert client.get(address, headers={"Host": "evil.example"}).status_code == 421
+        answer = client.get(address)
+        assert answer.status_code == 303
+        assert "httponly" in answer.headers["set-cookie"].lower()
+        assert client.get(base).status_code == 200
+        for path in ("..%2fdesk.py", "desk.py", "%2e%2e/server.py", "app.js/"):
+            assert client.get(base + path).status_code == 404
+        cookie = answer.headers["set-cookie"].split(";")[0]
+    plain, keyed = socket_address(address, ""), socket_address(address)
+    refused = (
+        (plain, {}),
+        (socket_address(address, "?token=wrong"), {}),
+        (keyed, {"Origin": "http://evil.example"}),
+        (keyed, {"Origin": "null"}),
+        (plain, {"Cookie": cookie, "Origin": f"http://{host}0"}),
+        (keyed.replace("127.0.0.1", "localhost"), {}),
+    )
+    for url, headers in refused:
+        with pytest.raises(InvalidStatus), connect(url, additional_headers=headers, proxy=None):
+            pass
+    own = {"Cookie": cookie, "Origin": f"http://{host}"}
+    with connect(plain, additional_headers=own, proxy=None) as good:
+        assert json.loads(good.recv())["type"] == "hello"
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        ("no json", "not JSON"),
+        ("[1]", "not a JSON object"),
+        ("[" * 30_000, "not JSON"),
+        (b"\x00\x01", "are text"),
+        ('{"type": "shutdown"}', "'shutdown' is not one of start"),
+        ('{"type": 3}', "with a type"),
+        ('{"type": "hold"}', "axes must be 6 finite numbers"),
+        ('{"type": "hold", "axes": [0, 0, 0, 0, 0, NaN]}', "axes must be 6"),
+        ('{"type": "hold", "axes": [0, 0, 0, 0, 0, 1.5]}', "from -1 to 1"),
+        ('{"type": "hold", "axes": [true, 0, 0, 0, 0, 0]}', "axes must be 6"),
+        ('{"type": "act"}', "a list of 1 to 256"),
+        ('{"type": "act", "actions": [[0, 0, 0]]}', "2 numbers"),
+        ('{"type": "act", "actions": [[0, 0], [0, 1.01]]}', "value 1 is 1.01"),
+        ('{"type": "act", "actions": [[Infinity, 0]]}', "value 0 is inf"),
+        ('{"type": "act", "actions": [["x", 0]]}', "a list of 2 numbers"),
+        ('{"type": "act", "actions": [[1e400, {}]]}', "a list of 2 numbers"),
+        ('{"type": "back", "steps": -4}', "from 1 to"),
+        ('{"type": "back", "steps": 1.5}', "whole number"),
+        ('{"type": "start", "number": 0}', "lists no starts"),
+        ('{"type": "start", "task": "push-left", "seed": -1}', "seed must be"),
+        ('{"type": "start", "task": 7}', "task must be text"),
+        ('{"type": "mark", "stage": ["a"]}', "stage must be text"),
+        ('{"type": "gripper"}', "no gripper"),
+        ('{"type": "hand_back"}', "nobody waits"),
+        ('{"type": "status", "id": "x"}', "id must be"),
+    ],
+)
+def test_a_bad_message_is_refused_in_words_and_nothing_else_happens(address, sent, why):
+    with Client(address) as client:
+        client.start("push-left", seed=3, discard=True)
+        client.act([0.5, 0.5])
+        client._socket.send(sent)
+        while (said := json.loads(client._receive()))["type"] != "reply":
+            pass
+        assert not said["ok"]
+        assert why in said["message"]
+        client.look()
+        assert client.status["step"] == 1
+
+
+def test_a_message_too_large_ends_the_connection_and_only_that(address):
+    with Client(address) as client:
+        client._socket.send("x" * (MAX_SOCKET_MESSAGE_BYTES + 1))
+        with pytest.raises(ScenarioError, match="did not answer"):
+            client.look()
+    with Client(address) as client:
+        assert client.look() is not None
+
+
+def test_a_simulator_that_breaks_ends_its_recording_and_not_the_server(tmp_path):
+    with cockpit(tmp_path / "r") as found, Client(found) as client:
+        client.start("raises", suite="faults")
+        client.act(np.zeros((19, 2)))
+        with pytest.raises(TeleopRefusal, match="broke on purpose"):
+            client.act([0, 0])
+        with pytest.raises(TeleopRefusal, match="start a task first"):
+            client.finish(as_dropped=True)
+        client.start("push-left")
+        assert client.act([0, 0])["step"] == 1
+
+
+def test_whoever_watches_does_not_drive(address):
+    with Client(address) as first, Client(address) as second:
+        with pytest.raises(TeleopRefusal, match="somebody else drives"):
+            first.act([0, 0])
+        second.start("push-left", seed=1, discard=True)
+        first.ask("drive")
+        assert first.act([0, 0])["step"] == 1
+
+
+# --- time, keys, devices
+
+
+def ticks(pilot: Pilot, seconds: float) -> list[Tick]:
+    deadline, found = time.monotonic() + seconds, []
+    while (left := deadline - time.monotonic()) > 0:
+        event = pilot.poll(left)
+        if isinstance(event, Tick):
+            found.append(event)
+    return found
+
+
+ONE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NONE = (0.0,) * 6
+
+
+def test_time_passes_only_while_something_is_held():
+    pilot = Pilot(50.0, 50.0)
+    assert ticks(pilot, 0.1) == []
+    pilot.hold("keyboard", ONE)
+    pilot.hold("keyboard", NONE)
+    assert [t.axes for t in ticks(pilot, 0.1)] == [ONE], "a tap is one step"
+    pilot.hold("keyboard", ONE)
+    held = ticks(pilot, 1.2)
+    assert 10 <= len(held) <= 33, "nobody holds it any more after 0.6 seconds"
+    pilot.hold("keyboard", NONE, wait=True)
+    assert {t.axes for t in ticks(pilot, 0.1)} == {NONE}
+    pilot.let_go()
+    pilot.toggle_gripper()
+    assert len(moved := ticks(pilot, 1.0)) == 25, "half a second for the gripper"
+    assert all(t.closed for t in moved)
+    pilot.hold("keyboard", ONE)
+    pilot.hold("gamepad", (0.5, -0.5, 0, 0, 0, 0))
+    assert ticks(pilot, 0.1)[-1].axes == (1.0, -0.5, 0, 0, 0, 0)
+
+
+def test_steps_lost_to_a_picture_are_made_up_for_up_to_a_limit():
+    pilot = Pilot(50.0, 50.0)
+    pilot.realtime = True
+    pilot.poll(0.1)
+    time.sleep(0.5)
+    caught_up = 0
+    while isinstance(pilot.poll(0.0), Tick):
+        caught_up += 1
+    assert 11 <= caught_up <= 15, "a quarter of a second at 50 steps a second"
+
+
+def test_a_full_line_of_commands_refuses_more():
+    pilot, answers = Pilot(1.0, 1.0), []
+    for _ in range(300):
+        pilot.command(Command("status", {}, answers.append))
+    assert len(answers) == 44
+    assert "does not keep up" in answers[0]["message"]
+
+
+@pytest.mark.parametrize("platform", ["fake", "metaworld", "libero"])
+def test_every_axis_has_a_column_of_its_own_within_the_platforms_bounds(platform):
+    controls = controls_of(platform)
+    columns = [c for c, _ in controls.columns.values()] + ([controls.gripper[0]] if controls.gripper else [])
+    assert sorted(columns) == list(range(controls.width))
+    for i, name in enumerate(AXES):
+        axes = np.zeros(6)
+        axes[i] = -1.0
+        moved = controls.action(axes, closed=True)
+        assert controls.check(moved) is not None
+        changed = np.flatnonzero(moved != controls.action(NONE, closed=True)).tolist()
+        assert changed == ([controls.columns[name][0]] if name in controls.columns else [])
+    assert controls.closed_by(controls.action(NONE, True)) == (controls.gripper is not None)
+    assert not controls.closed_by(controls.action(NONE, False))
+
+
+def test_what_cannot_be_driven_says_why():
+    with pytest.raises(ScenarioError, match="14 absolute joint targets"):
+        controls_of("robotwin")
+    with pytest.raises(ScenarioError, match="--seeds '3-x'"):
+        first_states("fake", ["push-left"], "", "3-x", None)
+    with pytest.raises(ScenarioError, match="more than 100000"):
+        first_states("fake", ["push-left"], "", "0-4000000000", None)
+    with pytest.raises(ScenarioError, match="no init states"):
+        first_states("fake", ["push-left"], "", None, "0")
+    assert [s.reset.seed for s in first_states("fake", ["push-left"], "", "2-3,9", None)] == [2, 3, 9]
+
+
+def report(kind: int, *values: int) -> list[int]:
+    return list(bytes([kind]) + struct.pack(f"<{len(values)}h", *values))
+
+
+def test_spacemouse_reports_become_axes():
+    reports = Reports()
+    reports.take(report(1, 0, -350, 0))
+    assert reports.axes(0.5) == [0.5, 0, 0, 0, 0, 0], "pushed away from the user: forward"
+    reports.take(report(1, 700, 0, -182))
+    assert reports.axes(1.0)[:3] == pytest.approx([0, -1, (0.52 - 0.05) / 0.95]), "right, and lifted"
+    reports.take(report(2, 0, 0, 350))
+    assert reports.axes(1.0)[3:] == [0, 0, -1], "turned clockwise seen from above"
+    reports.take(report(1, 10, -10, 5, 350, 0, 0))
+    assert reports.axes(1.0) == [0, 0, 0, 0, -1, 0], "one report for all; a touch is nothing"
+    before = list(reports.raw)
+    for damaged in ([], [1], [1, 2, 3], [9, 1, 1, 1, 1, 1, 1], [2, 0, 0, 0]):
+        assert reports.take(damaged) == []
+    assert reports.raw == before
+    assert reports.take([3, 0b01, 0]) == [0]
+    assert reports.take([3, 0b11, 0]) == [1]
+    assert reports.take([3, 0b00, 0]) == []
+
+
+class Mouse:
+    """Gives reports one after another, then stays still; or is unplugged."""
+
+    def __init__(self, reports, unplugged=False):
+        self.reports, self.unplugged, self.closed = list(reports), unplugged, False
+
+    def read(self, size, timeout_ms):
+        if self.reports:
+            return self.reports.pop(0)
+        if self.unplugged:
+            raise OSError("read error")
+        time.sleep(timeout_ms / 1000)
+        return []
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_spacemouse_drives_and_may_be_unplugged(tmp_path):
+    away = report(1, 0, -350, 0, 0, 0, 0)
+    mice = [Mouse([away, [3, 1, 0], [3, 0, 0]], unplugged=True), Mouse([away, report(1, 0, 0, 0, 0, 0, 0)])]
+    pilot, opened = Pilot(50.0, 50.0), iter(mice)
+    mouse = SpaceMouse(pilot, 0.5, lambda: next(opened))
+    mouse.start()
+    event = pilot.poll(2.0)
+    assert isinstance(event, Tick)
+    assert (event.axes[0], event.device) == (0.5, "spacemouse")
+    while not isinstance(event, Command):
+        event = pilot.poll(2.0)
+    assert event.kind == "gripper"
+    event.reply({"ok": True})
+    assert mice[0].closed or ticks(pilot, 0.5) is not None
+    deadline = time.monotonic() + 5
+    while mice[1].reports and time.monotonic() < deadline:
+        pilot.poll(0.1)
+    mouse.stop()
+    assert mice[0].closed
+    assert mice[1].closed
+    assert not mice[1].reports, "it is found again"
