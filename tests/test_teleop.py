@@ -24,7 +24,7 @@ from lerobot_roborecover.build.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.build.teleop.controls import AXES, controls_of
 from lerobot_roborecover.build.teleop.desk import Desk
 from lerobot_roborecover.build.teleop.hub import Hub
-from lerobot_roborecover.build.teleop.pilot import Command, Pilot, Tick
+from lerobot_roborecover.build.teleop.pilot import HOLD_S, Command, Pilot, Tick
 from lerobot_roborecover.build.teleop.server import Cockpit, make_app
 from lerobot_roborecover.build.teleop.session import Session
 from lerobot_roborecover.build.teleop.spacemouse import Reports, SpaceMouse
@@ -379,6 +379,10 @@ def test_time_passes_only_while_something_is_held():
     pilot.hold("keyboard", NONE)
     assert [t.axes for t in ticks(pilot, 0.1)] == [ONE], "a tap is one step"
     pilot.hold("keyboard", ONE)
+    pilot.hold("keyboard", NONE)
+    time.sleep(HOLD_S + 0.1)
+    assert [t.axes for t in ticks(pilot, 0.1)] == [ONE], "also where the simulator was busy meanwhile"
+    pilot.hold("keyboard", ONE)
     held = ticks(pilot, 1.2)
     assert 10 <= len(held) <= 33, "nobody holds it any more after 0.6 seconds"
     pilot.hold("keyboard", NONE, wait=True)
@@ -434,6 +438,8 @@ def test_what_cannot_be_driven_says_why():
         first_states("fake", ["push-left"], "", "3-x", None)
     with pytest.raises(ScenarioError, match="more than 100000"):
         first_states("fake", ["push-left"], "", "0-4000000000", None)
+    with pytest.raises(ScenarioError, match="beyond 2"):
+        first_states("fake", ["push-left"], "", "0-99999999999999999999", None)
     with pytest.raises(ScenarioError, match="no init states"):
         first_states("fake", ["push-left"], "", None, "0")
     assert [s.reset.seed for s in first_states("fake", ["push-left"], "", "2-3,9", None)] == [2, 3, 9]

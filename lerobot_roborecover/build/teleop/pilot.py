@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -83,7 +83,7 @@ class Pilot:
 
     def hold(self, device: str, axes: Sequence[float], wait: bool = False) -> None:
         """Says what a device holds now."""
-        held = Hold(tuple(float(v) for v in axes), wait, time.monotonic() + HOLD_S)
+        held = Hold(tuple(float(v) for v in axes), wait)
         try:
             self._queue.put_nowait((device, held))
         except queue.Full:
@@ -137,7 +137,8 @@ class Pilot:
             # However briefly something was pressed: it gets a step before what comes after it.
             tick = self._tick(now) if drive and device in self._fresh else None
             before = self._holds.get(device)
-            self._holds[device] = held
+            # From now on, not from when it was said: a slow picture is no reason to let go.
+            self._holds[device] = replace(held, until=time.monotonic() + HOLD_S)
             if held.active:
                 self._device = device
                 if before is None or not before.active:
@@ -147,7 +148,8 @@ class Pilot:
 
     def _due(self, now: float) -> float | None:
         """When the next step is due; None while time stands still."""
-        self._holds = {d: h for d, h in self._holds.items() if h.until > now and h.active}
+        kept = ((d, h) for d, h in self._holds.items() if h.until > now or d in self._fresh)
+        self._holds = {d: h for d, h in kept if h.active}
         if not (self._holds or self._owed or self.realtime):
             self._last = 0.0
             return None

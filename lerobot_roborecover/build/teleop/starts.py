@@ -51,6 +51,8 @@ def numbers(text: str, option: str) -> list[int]:
         first, _, last = (piece.strip() for piece in part.partition("-"))
         if not first.isdecimal() or not (last or first).isdecimal():
             raise ScenarioError(f"{option} {text!r:.80} is not a list of numbers like 0-9,12")
+        if max(len(first), len(last)) > len(str(2**32)):
+            raise ScenarioError(f"{option} {text!r:.80} names a number beyond 2^32 - 1")
         span = range(int(first), int(last or first) + 1)
         if len(found) + len(span) > MAX_STARTS:
             raise ScenarioError(f"{option} lists more than {MAX_STARTS} numbers")
