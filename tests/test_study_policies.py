@@ -33,7 +33,7 @@ def demonstrations(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("episodes", [None, [0, 2]])
-def test_frames_from_memory_are_the_dataset_s(demonstrations, episodes, monkeypatch):
+def test_batches_from_memory_are_the_dataset_s(demonstrations, episodes, monkeypatch):
     import torch
     from lerobot.datasets.dataset_reader import DatasetReader
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -42,14 +42,15 @@ def test_frames_from_memory_are_the_dataset_s(demonstrations, episodes, monkeypa
 
     deltas = {"action": [i / 80 for i in range(12)], "observation.state": [-1 / 80, 0.0]}
     dataset = LeRobotDataset("a/b", root=demonstrations, episodes=episodes, delta_timestamps=deltas)
-    read = [dataset[i] for i in range(len(dataset))]
-    monkeypatch.setattr(DatasetReader, "_query_hf_dataset", None)  # nothing is read any more
+    order = np.random.default_rng(0).permutation(len(dataset)).tolist()
+    read = list(torch.utils.data.DataLoader(dataset, batch_size=8, sampler=order))
+    monkeypatch.setattr(DatasetReader, "get_item", None)  # nothing is read any more
     with frames_in_memory():
-        kept = [dataset[i] for i in range(len(dataset))]
+        kept = list(torch.utils.data.DataLoader(dataset, batch_size=8, sampler=order))
     for one, other in zip(read, kept, strict=True):
         assert one.keys() == other.keys()
         for key, value in one.items():
-            if isinstance(value, str):
+            if isinstance(value, list):
                 assert value == other[key]
             else:
                 assert value.dtype == other[key].dtype

@@ -18,6 +18,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 
+class FramesBatch(dict[str, Any]):
+    """A batch that is collated already."""
+
+
 class FramesInMemory:
     """The numbers of a dataset reader, as tensors.
 
@@ -31,7 +35,7 @@ class FramesInMemory:
         table = reader.hf_dataset.data.table
         self._columns = {name: torch.tensor(table[name].to_pylist()) for name in table.column_names}
         episodes = reader._meta.episodes
-        self._bounds = list(zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True))
+        self._bounds = np.stack([episodes["dataset_from_index"], episodes["dataset_to_index"]], axis=1)
         self._deltas = {key: np.array(steps) for key, steps in (reader.delta_indices or {}).items()}
         self._tasks = list(reader._meta.tasks.index)
         # Where an episode's frames begin among those that were loaded (all of them, or some episodes').
@@ -39,40 +43,42 @@ class FramesInMemory:
         self._row_of = np.full(int(loaded.max()) + 1, -1)
         self._row_of[loaded] = np.arange(len(loaded))
 
-    def item(self, row: int) -> dict[str, Any]:
-        """What `DatasetReader.get_item(row)` returns."""
+    def batch(self, rows: list[int]) -> FramesBatch:
+        """What PyTorch's collation makes of `DatasetReader.get_item` of each of the rows."""
         import torch
 
-        item: dict[str, Any] = {name: column[row] for name, column in self._columns.items()}
-        first, end = self._bounds[int(item["episode_index"])]
+        batch = FramesBatch({name: column[rows] for name, column in self._columns.items()})
+        index, bounds = batch["index"].numpy(), self._bounds[batch["episode_index"].numpy()]
         for key, steps in self._deltas.items():
-            wanted = int(item["index"]) + steps
-            item[f"{key}_is_pad"] = torch.from_numpy((wanted < first) | (wanted >= end))
-            item[key] = self._columns[key][self._row_of[np.clip(wanted, first, end - 1)]]
-        item["task"] = self._tasks[int(item["task_index"])]
-        return item
+            wanted = index[:, None] + steps
+            first, end = bounds[:, :1], bounds[:, 1:]
+            batch[f"{key}_is_pad"] = torch.from_numpy((wanted < first) | (wanted >= end))
+            batch[key] = self._columns[key][self._row_of[np.clip(wanted, first, end - 1)]]
+        batch["task"] = [self._tasks[task] for task in batch["task_index"]]
+        return batch
 
 
 @contextmanager
 def frames_in_memory() -> Iterator[None]:
-    """While it lasts, LeRobot's datasets without pictures answer from memory."""
-    from lerobot.datasets.dataset_reader import DatasetReader
+    """While it lasts, data loaders get whole batches of LeRobot's datasets without pictures from memory."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from torch.utils.data._utils.collate import default_collate_fn_map
 
-    slow = DatasetReader.get_item
     frames: WeakKeyDictionary[Any, FramesInMemory] = WeakKeyDictionary()
 
-    def get_item(reader: Any, row: int) -> dict[str, Any]:
-        if reader._meta.camera_keys or reader._image_transforms is not None:
-            return slow(reader, row)
-        if reader not in frames:
-            frames[reader] = FramesInMemory(reader)
-        return frames[reader].item(row)
+    def getitems(dataset: Any, rows: list[int]) -> list[Any]:
+        if dataset.meta.camera_keys or dataset.meta.has_language_columns:
+            return [dataset[row] for row in rows]
+        if dataset not in frames:
+            frames[dataset] = FramesInMemory(dataset.reader)
+        return [frames[dataset].batch(rows)]
 
-    DatasetReader.get_item = get_item
+    LeRobotDataset.__getitems__ = getitems
+    default_collate_fn_map[FramesBatch] = lambda batches, collate_fn_map: dict(batches[0])
     try:
         yield
     finally:
-        DatasetReader.get_item = slow
+        del LeRobotDataset.__getitems__, default_collate_fn_map[FramesBatch]
 
 
 def main() -> None:
