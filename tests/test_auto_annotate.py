@@ -95,8 +95,8 @@ def test_each_deviation_has_its_label_at_its_step(case, eye):
     thing, closed, step, stage, deviation = CASES[case]
     found = judge(seen(eye, closed, thing=thing), EYES[eye])
     assert (found.stage, found.deviation, found.discard) == (stage, deviation, "")
-    # The looks are ten frames apart, rest takes 12 frames and being stuck 20.
-    assert step <= found.step <= step + 32
+    # Looks are ten frames apart, rest takes 12 frames, and the last 2 or 3 cm are no progress.
+    assert step - 10 <= found.step <= step + 22
 
 
 @pytest.mark.parametrize("eye", EYES)
@@ -122,7 +122,7 @@ def test_discards(eye):
     # It is on the move up to the last frame: nothing is final.
     moving = {"reach": ramp((0, 0.4), (LAST, 0.02)), "goal": np.full(LAST + 1, 0.3)}
     assert verdict(moving) == "unclear"
-    stopped = {"reach": ramp((0, 0.4), (40, 0.2), (100, 0.2), (LAST, 0.02)), "goal": moving["goal"]}
+    stopped = {"reach": ramp((0, 0.4), (40, 0.2), (150, 0.2), (LAST, 0.02)), "goal": moving["goal"]}
     assert verdict(stopped) == "temporary"
 
 

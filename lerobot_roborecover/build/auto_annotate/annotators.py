@@ -26,15 +26,16 @@ class Eye:
     """An object that went this far with the hand was in the grasp."""
     lost_m: float = 0.05
     """An object that was carried and is farther from the hand than this is lost."""
-    rest_m: float = 0.004
-    """An object that moves less than this within `rest_s` lies still."""
+    rest_m: float = 0.01
+    """An object that moves less than this within `rest_s` lies still, or is as good as still."""
     rest_s: float = 0.15
     stuck_m: float = 0.015
     """The hand is stuck where its distance to every object changes by less from `stuck_s` before to `stuck_s`
     after."""
     stuck_s: float = 0.25
     event_m: float = 0.05
-    """An object that moves by more than this later was not final where it was."""
+    """Half of this nearer to the goal is progress; where no goal is known, an object that moves by more than
+    this later was not final where it was."""
     stable_s: float = 0.5
     """How long a deviation has to last."""
 

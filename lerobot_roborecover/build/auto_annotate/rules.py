@@ -94,23 +94,30 @@ class _Seen:
         return bool(self._moved[self.main].max() > THROWN_M)
 
     def final_point(self) -> tuple[int, tuple[Stage, DeviationType]] | None:
-        """Where the last deviation begins: after the last event, the first look of the run of equal labels
-        that lasts to the end."""
-        labelled = [i for i in range(self.n) if self.labels[i] is not None and not self._event_follows(i)]
-        run: list[int] = []
-        for i in reversed(labelled):
-            if run and self.labels[i] != self.labels[run[-1]]:
-                break
-            run.append(i)
-        if not run or self.seconds[run[0]] - self.seconds[run[-1]] < self.eye.stable_s:
-            return None
-        label = self.labels[run[-1]]
-        assert label is not None
-        return run[-1], label
+        """Where the last deviation begins: the first look of the last run of equal labels that is long
+        enough, where nothing but shorter ones follows, and no progress."""
+        for run in reversed(self._runs([self._final(i) for i in range(self.n)])):
+            if self.seconds[run[-1]] - self.seconds[run[0]] >= self.eye.stable_s:
+                label = self.labels[run[0]]
+                assert label is not None
+                return run[0], label
+        return None
 
     def any_point(self) -> bool:
         """Whether anything went wrong for a while."""
-        return any(label is not None for label in self.labels)
+        runs = self._runs([True] * self.n)
+        return any(self.seconds[run[-1]] - self.seconds[run[0]] >= self.eye.stable_s for run in runs)
+
+    def _runs(self, wanted: list[bool]) -> list[list[int]]:
+        """Looks with the same label one after the other; looks without one do not interrupt."""
+        runs: list[list[int]] = []
+        for i in range(self.n):
+            if self.labels[i] is None or not wanted[i]:
+                continue
+            if not runs or self.labels[runs[-1][-1]] != self.labels[i]:
+                runs.append([])
+            runs[-1].append(i)
+        return runs
 
     def human_point(self) -> tuple[int, tuple[Stage, DeviationType]] | None:
         """Where the person stopped for longest, before putting it right."""
@@ -166,32 +173,28 @@ class _Seen:
         return put
 
     def _label(self, i: int) -> tuple[Stage, DeviationType] | None:
-        """Stage and type of a stable deviation at a look, or None where there is none (yet)."""
-        if not self._rests(i):
-            return None
+        """Stage and type of a deviation at a look, or None where there is none (yet)."""
         eye, reach = self.eye, self._reach[self.main][i]
         placed = self.goal[i] < eye.place_m
         hand = Stage.CONTACT if reach <= eye.contact_m else Stage.APPROACH
+        if self.held[i]:
+            if any(self._moved[name][i] > eye.knocked_m for name in self.others) and self._rests(i):
+                return Stage.PLACE, DeviationType.SCENE_CHANGE
+            stage = Stage.PLACE if placed else Stage.MOVE
+            return (stage, DeviationType.WRONG_POSE) if self._stalled(i) or self._stuck(i) else None
+        if not self._rests(i):
+            return None
         if self._at_other(i) and not self.carried[i]:
             return hand, DeviationType.WRONG_TARGET
-        if self.held[i]:
-            if any(self._moved[name][i] > eye.knocked_m for name in self.others):
-                return Stage.PLACE, DeviationType.SCENE_CHANGE
-        elif self.carried[i]:
-            if self._released[i] and not placed and self._has_goal and reach < eye.contact_m:
-                return Stage.PLACE, DeviationType.WRONG_TARGET
-            if reach < eye.lost_m:
-                return None
+        if self.carried[i] and self._released[i] and not placed and self._has_goal and reach < eye.contact_m:
+            return Stage.PLACE, DeviationType.WRONG_TARGET
+        if self.carried[i] and reach >= eye.lost_m:
             if placed:
                 return Stage.PLACE, DeviationType.SCENE_CHANGE
             return hand, DeviationType.STAGE_ROLLBACK
-        elif self._sideways(i) > eye.knocked_m:
+        if not self.carried[i] and self._sideways(i) > eye.knocked_m:
             return hand, DeviationType.SCENE_CHANGE
-        if not self._stuck(i):
-            return None
-        if self.held[i]:
-            hand = Stage.PLACE if placed else Stage.MOVE
-        return hand, DeviationType.WRONG_POSE
+        return (hand, DeviationType.WRONG_POSE) if self._stalled(i) or self._stuck(i) else None
 
     def _at_other(self, i: int) -> bool:
         """The hand is at a part that is not to be handled, and has moved it."""
@@ -218,19 +221,31 @@ class _Seen:
         spans = [np.ptp(reach[window]) for reach in self._reach.values()]
         return bool(max(spans) < self.eye.stuck_m and self._span(self.main, window) < self.eye.stuck_m)
 
-    def _event_follows(self, i: int) -> bool:
-        """Whether an object moves again later, or comes nearer to its place."""
+    def _stalled(self, i: int) -> bool:
+        """Whether there is no progress any more, up to the end: the object does not come nearer to its goal,
+        nor, where it is not in the grasp, the hand to the object."""
+        reach, some = self._reach[self.main], self.eye.event_m / 2
+        if not self._has_goal or self._progress_follows(i):
+            return False
+        return bool(self.held[i] or reach[i] - reach[i:].min() < some)
+
+    def _final(self, i: int) -> bool:
+        """Whether a look's label is not overcome later."""
+        label = self.labels[i]
+        if label is None or self._progress_follows(i):
+            return False
+        return label[1] is not DeviationType.WRONG_POSE or not self._has_goal or self._stalled(i)
+
+    def _progress_follows(self, i: int) -> bool:
+        """Whether the object comes nearer to its goal later; where that is not known, whether it moves."""
+        if self._has_goal:
+            return bool(self.goal[i] - self.goal[i:].min() > self.eye.event_m / 2)
         away = max(
             np.abs(values[name][i:] - values[name][i]).max()
             for values in (self._moved, self._height)
             for name in (self.main, *self.others)
         )
-        if not self._has_goal:
-            return bool(away > self.eye.event_m)
-        nearer = self.goal[i] - self.goal[i:].min() > self.eye.event_m / 2
-        return bool(
-            away > self.eye.event_m or nearer or self.goal[i:].max() - self.goal[i] > self.eye.event_m
-        )
+        return bool(away > self.eye.event_m)
 
     def _travel(self, name: str, i: int, j: int) -> float:
         """How far an object has gone from one look to another, as far as the numbers tell."""
