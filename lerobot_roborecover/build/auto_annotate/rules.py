@@ -27,7 +27,7 @@ CARRY_STEP_M, CARRY_REACH_M, CARRY_GAP_S, CARRY_S = 0.004, 0.008, 0.2, 0.15
 while its distance from the hand changes by less than the second, and that for at least so long..."""
 HELD_REACH_M = 0.015
 """... and stays in the grasp while that distance stays within this."""
-PAUSE_M_S, PAUSE_S = 0.02, 0.4
+PAUSE_M_S, PAUSE_S = 0.04, 0.3
 """A person who stops has the hand slower than this for at least this long."""
 
 
