@@ -20,6 +20,8 @@ from lerobot_roborecover.scenario import ScenarioError
 
 START_S = 120.0
 """Longest that the server may take to start."""
+VIEWPORT = {"width": 640, "height": 480}
+"""Nobody looks at it, and painting is what costs."""
 _SAY_EVERY = 20
 
 
@@ -40,7 +42,7 @@ def annotate(config: AnnotateConfig, say: Callable[[str], None]) -> None:
         )
     with _server(config) as addresses, browser() as made:
         for name in config.annotators:
-            context = made.new_context(viewport={"width": 1366, "height": 900})
+            context = made.new_context(viewport=VIEWPORT)
             page = context.new_page()
             page.set_default_timeout(SLOW_MS)
             page.goto(addresses[name])
