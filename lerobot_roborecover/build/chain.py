@@ -15,6 +15,7 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,7 +27,7 @@ from lerobot_roborecover.build.candidates_write import merge_candidates
 from lerobot_roborecover.build.chain_commands import Places
 from lerobot_roborecover.build.chain_config import ChainConfig
 from lerobot_roborecover.build.funnel import read_decisions
-from lerobot_roborecover.build.journal import Journal
+from lerobot_roborecover.build.journal import Journal, read_journal
 from lerobot_roborecover.build.resolution import ResolutionConfig, queued, resolve, write_discussion
 from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.schema import FOLDER
@@ -108,8 +109,9 @@ class Chain:
                 f"--from {first} --until {until}: the stages come in the order {', '.join(STAGES)}"
             )
         done = []
-        with Journal(self.places.root / JOURNAL_FILE, _SCHEMA) as journal:
-            known = {r["label"]: r["key"] for r in journal.records}
+        path = self.places.root / JOURNAL_FILE
+        with nullcontext() if dry_run else Journal(path, _SCHEMA) as journal:
+            known = {r["label"]: r["key"] for r in read_journal(path, _SCHEMA)}
             key = ""
             for stage in self._stages():
                 if until and STAGES.index(stage.name) > STAGES.index(until):
@@ -121,7 +123,7 @@ class Chain:
                 fresh = known.get(stage.label) == key and there and stage.complete and not forced
                 self.say(f"{stage.label}: {'up to date' if fresh else 'would run' if dry_run else 'runs'}")
                 seconds = 0.0
-                if not fresh and not dry_run:
+                if not fresh and journal is not None:
                     began = time.monotonic()
                     # A stage that was killed may have its result, but no record. `collect` knows its own;
                     # what the others make is made anew, from what they keep beside it.

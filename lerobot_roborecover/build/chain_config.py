@@ -86,7 +86,7 @@ class ScreenPart:
 
     policies: list[PolicyPart] = field(default_factory=list)
     trials: int | None = None
-    keep: list[float] | None = None
+    keep: list[Any] | None = None
     max_invalid: int | None = None
     run_seed: int | None = None
     device: str | None = None
