@@ -20,7 +20,7 @@ from lerobot_roborecover.scenario import ScenarioError
 
 START_S = 120.0
 """Longest that the server may take to start."""
-VIEWPORT = {"width": 640, "height": 480}
+VIEWPORT = {"width": 900, "height": 640}
 """Nobody looks at it, and painting is what costs."""
 _SAY_EVERY = 20
 
@@ -46,7 +46,7 @@ def annotate(config: AnnotateConfig, say: Callable[[str], None]) -> None:
             page = context.new_page()
             page.set_default_timeout(SLOW_MS)
             page.goto(addresses[name])
-            page.wait_for_selector("#cameras canvas[data-episode]")
+            page.wait_for_selector("#cameras canvas[data-episode]", state="attached")
             _all(name, Annotator(page, EYES[name]), say)
             context.close()
 
