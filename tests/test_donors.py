@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from factories import fake_scenario
+from factories import fake_scenario, save_policy
 from loop import push_policy
 from trial_rows import trial_row, write_log
 
@@ -19,7 +23,13 @@ from lerobot_roborecover.build.donors import (
     judge,
     write_donors,
 )
-from lerobot_roborecover.build.policy_trials import ACTIONS_FOLDER, PolicyTrial, actions_digest, actions_path
+from lerobot_roborecover.build.policy_trials import (
+    ACTIONS_FOLDER,
+    PolicyTrial,
+    actions_digest,
+    actions_path,
+    read_trials,
+)
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import ScenarioError
@@ -247,3 +257,39 @@ def test_a_dataset_takes_over_the_statistics_of_the_checkpoint_it_continues(tmp_
 def test_thresholds_that_make_no_sense(options):
     with pytest.raises(ScenarioError, match=r"at least 1|rates are from 0 to 1"):
         DonorOptions(**options)
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_trials_of_a_donor_go_on_after_a_kill(tmp_path):
+    """Whenever the process is killed: each trial once, with its actions, as without the kill."""
+    policy = save_policy(tmp_path / "policy")
+    made = write_scenarios(tmp_path / "set", scenarios())
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from lerobot_roborecover.build.policy_trials import env_config, run_trials\n"
+        "env = env_config('fake', sys.argv[2])\n"
+        "run_trials(sys.argv[1], env, Path(sys.argv[3]), trials=20, device='cpu', max_batch=1)"
+    )
+
+    def start(folder: Path) -> subprocess.Popen:
+        command = [sys.executable, "-c", program, str(policy), str(made), str(folder)]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    log = tmp_path / "killed" / "trials.jsonl"
+    killed = start(tmp_path / "killed")
+    while not (log.exists() and log.read_bytes().count(b"\n") > 10):
+        assert killed.poll() is None, "it ended before it could be killed"
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    before = len(read_trials(tmp_path / "killed"))
+    assert before < 120
+    for folder in ("killed", "whole"):
+        assert start(tmp_path / folder).wait() == 0
+    told = [
+        {(t.row.scenario_id, t.row.trial): (t.row.outcome, t.row.steps, t.actions.tobytes()) for t in found}
+        for found in (read_trials(tmp_path / "killed"), read_trials(tmp_path / "whole"))
+    ]
+    assert len(read_trials(tmp_path / "killed")) == len(told[0]) == 120
+    assert told[0] == told[1]

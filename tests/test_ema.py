@@ -156,8 +156,9 @@ def test_correction_act_trains_saves_resumes_and_exports(lerobot_train, donors, 
 
 
 @pytest.mark.slow
-def test_correction_pi05_trains_and_exports(lerobot_train, tmp_path, monkeypatch):
-    """The paper's configuration on a small random pi05, from its checkpoint, in bfloat16."""
+@pytest.mark.parametrize("kind", ["pi05", "smolvla"])
+def test_correction_of_a_vision_language_policy(kind, lerobot_train, tmp_path, monkeypatch):
+    """The paper's configuration on a small random checkpoint: trains, goes on after a crash, exports."""
     from huggingface_hub import constants
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies import get_policy_class
@@ -173,17 +174,26 @@ def test_correction_pi05_trains_and_exports(lerobot_train, tmp_path, monkeypatch
     # Training reshapes to eight heads, whatever the configuration says.
     heads = {"width": 32, "depth": 2, "mlp_dim": 32, "num_heads": 8, "num_kv_heads": 1, "head_dim": 16}
     monkeypatch.setattr(modeling_pi05, "get_gemma_config", lambda _: modeling_pi05.GemmaConfig(**heads))
-    base = save_family(tmp_path / "pi05", "pi05", cache, images=("observation.image",))
+    base = save_family(tmp_path / kind, kind, cache, images=("observation.image",))
     found = write_fake_donors(tmp_path / "donors", obs_type="pixels_agent_pos", observation_size=64)
+    out = tmp_path / "out"
     lerobot_train(
-        f"--config_path={CONFIGS / 'correction_pi05.yaml'}", f"--policy.path={base}", "--policy.device=cpu",
-        "--dataset.repo_id=local/donors", f"--dataset.root={found}", f"--output_dir={tmp_path / 'out'}",
-        "--steps=2", "--batch_size=2", "--num_workers=0", "--save_freq=2",
+        f"--config_path={CONFIGS / f'correction_{kind}.yaml'}", f"--policy.path={base}",
+        "--policy.device=cpu", "--dataset.repo_id=local/donors", f"--dataset.root={found}",
+        f"--output_dir={out}", "--steps=2", "--batch_size=2", "--num_workers=0", "--save_freq=1",
     )  # fmt: skip
-    assert export_ema(tmp_path / "out" / "checkpoints" / "last", tmp_path / "exported") > 10
+    # As after a crash at step 1: what came later is gone.
+    shutil.rmtree(out / "checkpoints" / "000002")
+    last = out / "checkpoints" / "last"
+    last.unlink()
+    last.symlink_to("000001")
+    resume = last / "pretrained_model" / "train_config.json"
+    lerobot_train(f"--config_path={resume}", "--resume=true")
+    assert last.resolve().name == "000002"
+    assert export_ema(last, tmp_path / "exported") > 10
     config = PreTrainedConfig.from_pretrained(tmp_path / "exported")
-    assert (config.chunk_size, config.n_action_steps) == (10, 10)
-    get_policy_class("pi05").from_pretrained(tmp_path / "exported", config=config)
+    assert config.n_action_steps == 10
+    get_policy_class(kind).from_pretrained(tmp_path / "exported", config=config)
 
 
 def test_what_holds_no_average_is_refused(tmp_path, capsys):

@@ -20,6 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
     add("--every", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
     add("--slots", type=int, default=0, help="simulators at once (0: one per core)")
+    add(
+        "--make", action="store_true",
+        help="make the study first, from nothing but the packages: train, build, fine-tune (hours)",
+    )  # fmt: skip
+    add("--stage", action="append", default=[], metavar="NAME", help="with --make: this stage only; again")
     add("--print", action="store_true", help="print the commands and run nothing")
     add("--no-report", action="store_true", help="stop after the trials and the comparison")
 
@@ -39,7 +44,17 @@ def run(args: argparse.Namespace) -> int:
 
     if args.every < 1:
         raise OptionError(f"--every={args.every}: a count from 1")
-    study = read_definition(args.data or shipped_study())
+    if args.stage and not args.make:
+        raise OptionError("--stage names a stage of --make; add --make")
+    if args.make:
+        if args.data:
+            raise OptionError("--make makes its own data below --out; leave out --data")
+        from lerobot_roborecover.study.make import make
+
+        made = make(args.out, args.stage, say=lambda line: print(line, flush=True))
+        if made is None:
+            return 0
+    study = read_definition(args.out / "data" if args.make else args.data or shipped_study())
     if args.print:
         todo = list(
             arms(study, args.out, scenario_ids(study, args.every) if args.every > 1 else (), args.slots)

@@ -1,0 +1,208 @@
+"""Makes a study from nothing but the packages: policies, scenarios, Correction, monitor. Hours on two cores.
+
+Every stage is one of the project's own commands. A stage whose result is there is not run again, and each
+command goes on by itself where it was stopped; so a rerun continues.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from lerobot_roborecover.env.parent import end_with_parent
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.definition import StudyDefinition, write_definition
+
+POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 5, "diffusion_few": 5, "tdmpc": 1}
+"""Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
+SCREENING = ("act", "tdmpc", "act_few", "diffusion_few")
+"""Policies of the screening (policies/build/metaworld_study.yaml)."""
+BASE = "act"
+CHAIN, CHAIN_ROOT = Path("policies/build/metaworld_study.yaml"), "outputs/study"
+"""The scenarios' recipe, and the folder that it works in unless told otherwise."""
+INTERVENTIONS = ("reversion", "correction", "monitor_reversion", "monitor_correction")
+KERNELS: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_CBWR": "COMPATIBLE",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+}
+"""torch's kernels chosen alike on every x86-64 processor, so that policies round alike."""
+_ENV = {"obs_type": "state"}
+_CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of making a study."""
+
+    name: str
+    commands: tuple[tuple[str, ...], ...]
+    """Program and arguments, after `python -m`."""
+    done: Path
+    """Exists once the stage is finished."""
+    partial: tuple[Path, ...] = ()
+    """Results of an interrupted run that the commands would refuse to write over."""
+
+
+def stages(out: Path) -> list[Stage]:
+    """The stages in their order; everything lies below `out`."""
+    policy = lambda name: str(out / "policies" / name)  # noqa: E731
+    trials = out / "scenarios" / "screened.trials"
+    scenarios = out / "scenarios" / "split"
+    env = [part for name, value in _ENV.items() for part in ("--env", f"{name}={value}")]
+    logs = [str(trials / name / "trials.jsonl") for name in SCREENING]
+    donors = [part for name in SCREENING if name != BASE for part in ("--donor", policy(name))]
+    correction, monitor = out / "correction_training", out / "monitor_training"
+    return [
+        Stage(
+            "policies",
+            (("lerobot_roborecover.build.study_policies", "--out", str(out), "--trials", "0"),),
+            out / "policies" / "diffusion_few",
+        ),
+        Stage(
+            "driven",
+            (("lerobot_roborecover.build.scripted_operator", "--out", str(out / "driven")),),
+            out / "driven" / "meta" / "roborecover" / "candidates.json",
+        ),
+        Stage(
+            "scenarios",
+            (_cli("build", str(out / CHAIN.name)),),
+            scenarios,
+        ),
+        Stage(
+            "donors",
+            (_cli(
+                "donors", *logs, "--scenarios", str(scenarios), "--base", policy(BASE), *donors, *env,
+                "--out", str(out / "donors"), "--license", "Apache-2.0",
+            ),),
+            out / "donors" / "meta" / "roborecover" / "donors.json",
+            (out / "donors",),
+        ),
+        Stage(
+            "correction",
+            (
+                ("lerobot.scripts.lerobot_train", "--config_path=policies/train/correction_act.yaml",
+                 f"--policy.path={policy(BASE)}", f"--dataset.root={out / 'donors'}",
+                 f"--output_dir={correction}"),
+                _cli("export-ema", str(correction / _CHECKPOINT.parent), "--out", str(out / "correction")),
+            ),
+            out / "correction",
+            (correction,),
+        ),
+        Stage(
+            "monitor data",
+            (_cli(
+                "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
+                *(part for name in SCREENING for part in ("--policy", policy(name))),
+                "--out", str(out / "monitor_data"), "--license", "Apache-2.0",
+            ),),
+            out / "monitor_data" / "validation_natural",
+        ),
+        Stage(
+            "monitor",
+            (("lerobot.scripts.lerobot_train", "--config_path=policies/train/monitor_small.yaml",
+              f"--dataset.root={out / 'monitor_data' / 'train'}", f"--output_dir={monitor}"),),
+            monitor / _CHECKPOINT,
+            (monitor,),
+        ),
+        Stage(
+            "monitor metrics",
+            (_cli(
+                "eval-monitor", "--monitor", str(monitor / _CHECKPOINT),
+                "--data", str(out / "monitor_data" / "validation_balanced"),
+                "--data", str(out / "monitor_data" / "validation_natural"),
+                "--out", str(out / "monitor_report"),
+            ),),
+            out / "monitor_report" / "metrics.json",
+        ),
+    ]  # fmt: skip
+
+
+def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print) -> StudyDefinition | None:
+    """Runs what is missing and puts the study together in `out/data`; None where stages are left out.
+
+    Args:
+        out: working folder; a rerun goes on there.
+        only: names of stages; empty runs all.
+        say: takes progress lines.
+
+    Raises:
+        ScenarioError: a command failed, or there is no such stage.
+    """
+    todo = stages(out)
+    unknown = set(only) - {s.name for s in todo}
+    if unknown:
+        raise ScenarioError(f"no stage {sorted(unknown)}; there are {[s.name for s in todo]}")
+    if not CHAIN.is_file():
+        raise ScenarioError(
+            f"{CHAIN} is not here: a study is made in a checkout of the repository, whose top folder has the "
+            "configurations of its training and of its scenarios"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / CHAIN.name).write_text(CHAIN.read_text().replace(CHAIN_ROOT, str(out)))
+    for number, stage in enumerate(todo, 1):
+        where = f"[{number}/{len(todo)}] {stage.name}"
+        if only and stage.name not in only:
+            continue
+        if stage.done.exists():
+            say(f"{where}: there already")
+            continue
+        for left in stage.partial:
+            shutil.rmtree(left, ignore_errors=True)
+        began = time.monotonic()
+        for command in stage.commands:
+            say(f"{where}: python -m {shlex.join(command)}")
+            _run(command)
+        minutes = (time.monotonic() - began) / 60
+        say(f"{where}: {minutes:.1f} min")
+        with (out / "stages.jsonl").open("a") as file:
+            file.write(json.dumps({"stage": stage.name, "minutes": round(minutes, 1)}) + "\n")
+    return None if only else assemble(out)
+
+
+def assemble(out: Path) -> StudyDefinition:
+    """Copies what an evaluation needs into `out/data` and writes its definition."""
+    data = out / "data"
+    partial_data = out / "data.partial"
+    shutil.rmtree(partial_data, ignore_errors=True)
+    ignore = shutil.ignore_patterns("train_config.json", "videos", "images", "*.html")
+    for name in POLICIES:
+        shutil.copytree(out / "policies" / name, partial_data / "policies" / name, ignore=ignore)
+    kept = Path("meta") / "roborecover"
+    shutil.copytree(out / "scenarios" / "split" / kept, partial_data / "scenarios" / kept, ignore=ignore)
+    shutil.copytree(out / "correction", partial_data / "correction", ignore=ignore)
+    shutil.copytree(out / "monitor_training" / _CHECKPOINT, partial_data / "monitor", ignore=ignore)
+    study = StudyDefinition(
+        root=partial_data, platform="metaworld", policies=POLICIES, base=BASE, env=_ENV,
+        interventions=INTERVENTIONS, environment=KERNELS,
+    )  # fmt: skip
+    write_definition(study)
+    shutil.rmtree(data, ignore_errors=True)
+    os.replace(partial_data, data)
+    return study
+
+
+def _cli(*argv: str) -> tuple[str, ...]:
+    return ("lerobot_roborecover.cli.main", *argv)
+
+
+def _run(command: Sequence[str]) -> None:
+    environment = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1", **os.environ, **KERNELS}
+    done = subprocess.run(
+        [sys.executable, "-m", *command], env=environment, preexec_fn=partial(end_with_parent, os.getpid())
+    )
+    if done.returncode:
+        raise ScenarioError(
+            f"`python -m {shlex.join(command)}` ended with status {done.returncode}; what it said is above. "
+            "What had finished is kept: run the same command again"
+        )

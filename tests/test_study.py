@@ -1,0 +1,151 @@
+"""`roborecover study`: commands, stored outcomes, refusals; and a whole small study on the fake simulator."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from factories import fake_dataset, save_policy
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.commands import arms
+from lerobot_roborecover.study.definition import read_definition
+from lerobot_roborecover.study.make import stages
+from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
+
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """A study's folder on the fake simulator, without its definition."""
+    root = tmp_path_factory.mktemp("study")
+    fake_dataset(root / "scenarios", COUNT, horizon=12)
+    save_policy(root / "policies" / "act", "act")
+    shutil.copytree(root / "policies" / "act", root / "policies" / "other")
+    return root
+
+
+@pytest.fixture
+def study(parts, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(parts, root)
+    define(root)
+    return root
+
+
+def define(root, **changes) -> None:
+    found = {
+        "schema_version": 1, "platform": "fake", "policies": {"act": 1, "other": 2}, "base": "act",
+        "interventions": ["reversion"], "environment": {"OMP_NUM_THREADS": "1"},
+    }  # fmt: skip
+    (root / "study.json").write_text(json.dumps({**found, **changes}))
+
+
+def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
+    found = list(arms(read_definition(study), tmp_path / "out"))
+    labels = [a.label for a in found]
+    assert labels == [
+        "act/recovery", "act/initial", "other/recovery", "other/initial", "reversion/recovery"
+    ]  # fmt: skip
+    assert [a.trials for a in found] == [1, 1, 2, 2, 1]
+    assert all("--runner.max_batch=1" in a.argv for a in found)
+    assert f"--policy.base.path={study / 'policies' / 'act'}" in found[-1].argv
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["study", "--data", str(study), "--out", str(out), "--no-report", "--slots", "1"]) == 0
+    assert "5/5" in capsys.readouterr().out
+    outcomes = read_outcomes(out / "outcomes.csv")
+    assert len(outcomes) == COUNT * (1 + 1 + 2 + 2 + 1)
+
+    # Stored, and run again: elsewhere, with more simulators, on a part of the scenarios.
+    write_outcomes(study / "outcomes.csv", outcomes)
+    again = ["study", "--data", str(study), "--out", str(tmp_path / "again"), "--slots", "2", "--every", "2"]
+    assert main(again) == 0
+    assert f"{COUNT // 2 * 7} of {COUNT // 2 * 7} trials came out as stored" in capsys.readouterr().out
+    assert (tmp_path / "again" / "report" / "report.html").exists()
+
+    # A stored outcome that is another one is told apart.
+    key = next(k for k in outcomes if k[0] == "act/recovery")
+    write_outcomes(study / "outcomes.csv", {**outcomes, key: ("success", 3)})
+    assert main(["study", "--data", str(study), "--out", str(out), "--no-report"]) == 1
+    assert f"act/recovery {key[1]} trial 0: stored success after 3 steps" in capsys.readouterr().out
+
+
+trial = st.tuples(st.sampled_from(["a/recovery", "b"]), st.text('abc," \n', min_size=1), st.integers(0, 9))
+outcome = st.tuples(st.sampled_from(["success", "horizon"]), st.integers(0, 500))
+
+
+@given(st.dictionaries(trial, outcome))
+def test_outcomes_survive_their_file(tmp_path_factory, outcomes):
+    path = tmp_path_factory.mktemp("outcomes") / "outcomes.csv"
+    write_outcomes(path, outcomes)
+    assert read_outcomes(path) == outcomes
+
+
+@given(st.dictionaries(trial, outcome), st.dictionaries(trial, outcome))
+def test_each_trial_of_today_is_counted_once(stored, today):
+    found = compare(stored, today)
+    assert found.same + len(found.different) + found.unknown == len(today)
+    assert all(stored[key] == a and today[key] == b and a != b for key, a, b in found.different)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema_version": 9}, "field schema_version: 9"),
+        ({"policies": {}}, "field policies"),
+        ({"policies": {"../act": 1}}, "field policies: '../act'"),
+        ({"policies": {"act": 0}}, "field policies.act: 0; it must be a count from 1 to 1000"),
+        ({"policies": {"act": 1, "missing": 1}}, "names policy missing"),
+        ({"base": "nobody"}, "field base: 'nobody'; it must be one of"),
+        ({"interventions": ["human"]}, "field interventions: 'human'"),
+        ({"interventions": ["correction"]}, "mode correction needs a correction"),
+        ({"env": {"obs_type": 3}}, "field env"),
+        ({"colour": "red"}, "not a study's definition"),
+    ],
+)  # fmt: skip
+def test_a_definition_that_cannot_be_used(study, changes, message):
+    define(study, **changes)
+    with pytest.raises(ScenarioError, match="study[.]json") as caught:
+        read_definition(study)
+    assert message in str(caught.value)
+
+
+def test_refusals(study, tmp_path, capsys):
+    def refused(*argv: str) -> str:
+        assert main(["study", *argv]) == 2
+        return capsys.readouterr().err
+
+    assert "has no study.json" in refused("--data", str(tmp_path))
+    assert "--every=0: a count from 1" in refused("--data", str(study), "--every", "0")
+    assert "add --make" in refused("--stage", "policies")
+    (study / "outcomes.csv").write_text("arm,scenario_id,trial,outcome,steps\na,b,c,d,e\n")
+    with pytest.raises(ScenarioError, match="line 2"):
+        read_outcomes(study / "outcomes.csv")
+
+
+@pytest.mark.lerobot
+def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path, capsys):
+    (study / "policies" / "act" / "config.json").write_text("{}")
+    assert main(["study", "--data", str(study), "--out", str(tmp_path / "out"), "--no-report"]) == 2
+    message = capsys.readouterr().err
+    assert "ended with status" in message
+    assert "Run the same command again" in message
+
+
+def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
+    found = stages(tmp_path)
+    assert [s.name for s in found] == [
+        "policies", "driven", "scenarios", "donors", "correction", "monitor data", "monitor",
+        "monitor metrics",
+    ]  # fmt: skip
+    assert len({s.done for s in found}) == len(found)
