@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 
 import numpy as np
@@ -12,7 +13,9 @@ from teleop_sessions import driving, push
 
 from lerobot_roborecover.build.teleop.client import Client
 from lerobot_roborecover.build.teleop.store import read_recording
+from lerobot_roborecover.build.teleop.takeover import Takeover
 from lerobot_roborecover.build.teleop.write import recordings_folder
+from lerobot_roborecover.env.options import OptionError
 
 STARTS = ("--task=push-left", "--seeds=3-5")
 
@@ -163,6 +166,46 @@ def test_a_gamepad_drives(visit, out):
     assert saved.lacks == "not solved after the mark"
     assert saved.notes["devices"] == {"gamepad": driven}
     assert np.allclose(saved.actions, [0.25, 0.5])
+
+
+def test_a_person_takes_over_at_the_page(visit, tmp_path, monkeypatch):
+    torch = pytest.importorskip("torch")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    driver = Takeover(0)
+    page, said = visit(driver.address)
+    page.wait_for_selector("#instruction:has-text('Waiting for a policy')")
+    page.keyboard.press("KeyH")
+    page.wait_for_selector("#message:has-text('no policy has handed over yet')")
+    seen = {
+        "observation.state": torch.zeros(4),
+        "observation.environment_state": torch.zeros(6),
+        "observation.images.top": torch.rand(3, 24, 32),
+    }
+    actions, slot = [], driver.take("push the puck")
+
+    def evaluation() -> None:
+        while (action := driver.act(slot, seen)) is not None:
+            actions.append(action)
+        driver.leave(slot)
+
+    waiting = threading.Thread(target=evaluation, daemon=True)
+    waiting.start()
+    page.wait_for_selector('body[data-under="way"][data-mode="takeover"]')
+    page.wait_for_selector('#cameras canvas[data-camera="observation.images.top"]')
+    assert page.inner_text("#instruction") == "push the puck"
+    assert page.is_hidden("#save")
+    with pytest.raises(OptionError, match="one simulator at a time"):
+        driver.take("another")
+    hold(page, "KeyW", 3)
+    driven = still(page)
+    page.keyboard.press("KeyH")
+    page.wait_for_selector('body:not([data-under="way"])')
+    waiting.join(10)
+    assert not waiting.is_alive()
+    assert len(actions) == driven
+    assert np.allclose(actions, [0.0, 0.5])
+    assert actions[0].dtype == np.float32
+    assert said == []
 
 
 def test_interrupting_the_command_ends_it(out):

@@ -7,17 +7,19 @@ import { Link } from "./link.js";
 const SPEEDS = [0.1, 0.2, 0.35, 0.5, 0.75, 1];
 const TYPES = ["Wrong Target", "Wrong Pose", "Stage Rollback", "Scene Change"];
 const STAGES = ["Approach", "Contact", "Move", "Place"];
-const AGAIN_MS = 4000;
 const at = (id) => document.getElementById(id);
 
 let status = { under_way: false };
 let type = "", stage = "";
-let confirming = { what: "", until: 0 };
+let confirming = "";
 let pictures = 0, steps = 0, lastStep = 0;
 
 const link = new Link({ status: told, pictures: draw, state: connection });
 const inputs = new Inputs(
-  (device, axes, wait) => { if (drives()) link.tell("hold", { device, axes, wait }); },
+  (device, axes, wait) => {
+    if (confirming && (wait || axes.some((v) => v !== 0))) say("");
+    if (drives()) link.tell("hold", { device, axes, wait });
+  },
   (code) => press(code, false),
 );
 const speedAt = Number(sessionStorage.getItem("speed") ?? 3);
@@ -28,6 +30,7 @@ function drives() {
 }
 
 function say(text, good = false) {
+  confirming = "";
   at("message").textContent = text;
   at("message").classList.toggle("good", good);
 }
@@ -43,12 +46,12 @@ async function ask(kind, values) {
   }
 }
 
-// Asks for a second press where something would be lost.
+// Asks for a second press where something would be lost; it counts while the question stands there.
 function confirmed(what, text) {
-  const sure = confirming.what === what && performance.now() < confirming.until;
-  confirming = sure ? { what: "", until: 0 } : { what, until: performance.now() + AGAIN_MS };
-  if (!sure) say(text);
-  return sure;
+  if (confirming === what) return true;
+  say(text);
+  confirming = what;
+  return false;
 }
 
 async function start(number) {
