@@ -107,19 +107,36 @@ def test_each_policy_learns_from_its_share_of_every_task():
     assert (few == np.arange(12)).all()
 
 
-def test_an_interrupted_training_goes_on(tmp_path):
-    from lerobot_roborecover.build.study_policies import training_arguments
+def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
+    from lerobot_roborecover.build import study_policies
 
-    fresh = training_arguments("act", tmp_path)
+    commands = []
+
+    def stopped(command, check):
+        """Trains up to a checkpoint, and is killed unless it goes on from one."""
+        commands.append(command[3:])
+        folder = tmp_path / "train" / "act"
+        assert folder.exists() == ("--resume=true" in command), "LeRobot refuses a folder that is there"
+        last = folder / "checkpoints" / "last" / "pretrained_model"
+        last.mkdir(parents=True, exist_ok=True)
+        for file in ("train_config.json", "config.json"):
+            (last / file).write_text("{}")
+        if "--resume=true" not in command:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_policies.subprocess, "run", stopped)
+    (tmp_path / "train" / "act").mkdir(parents=True)  # of a run killed before its first checkpoint
+    with pytest.raises(KeyboardInterrupt):
+        study_policies.train("act", tmp_path)
+    assert not (tmp_path / "policies" / "act").exists()
+    for _ in range(2):  # the second time there is nothing left to do
+        study_policies.train("act", tmp_path)
+    fresh, resumed = commands
     assert fresh[0] == f"--config_path={Path('policies/train/study/act.yaml')}"
-    started = tmp_path / "train" / "act"
-    started.mkdir(parents=True)
-    assert training_arguments("act", tmp_path) == fresh
-    assert not started.exists(), "LeRobot refuses a folder that is there"
-    last = started / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    last.parent.mkdir(parents=True)
-    last.write_text("{}")
-    assert training_arguments("act", tmp_path) == [f"--config_path={last}", "--resume=true"]
+    last = tmp_path / "train" / "act" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    assert resumed == [f"--config_path={last}", "--resume=true"]
+    assert [file.name for file in (tmp_path / "policies" / "act").iterdir()] == ["config.json"]
+    assert "act" in (tmp_path / "durations.jsonl").read_text()
 
 
 def test_the_table_adds_up():

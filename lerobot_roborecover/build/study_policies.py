@@ -56,8 +56,6 @@ def training_arguments(name: str, out: Path) -> list[str]:
     last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     if last.exists():
         return [f"--config_path={last}", "--resume=true"]
-    if folder.exists():  # interrupted before its first checkpoint; LeRobot wants the folder not to be there
-        shutil.rmtree(folder)
     wanted = episodes(name)
     return [
         f"--config_path={CONFIGS / name}.yaml",
@@ -89,12 +87,15 @@ def train(name: str, out: Path) -> None:
     if result.exists():
         return
     with _timed(out, name):
+        folder, arguments = out / "train" / name, training_arguments(name, out)
+        if "--resume=true" not in arguments:  # LeRobot refuses the folder of a run without a checkpoint
+            shutil.rmtree(folder, ignore_errors=True)
         program = [sys.executable, "-m", "lerobot_roborecover.build.frames_in_memory"]
-        subprocess.run([*program, *training_arguments(name, out)], check=True)
+        subprocess.run([*program, *arguments], check=True)
     partial = result.with_name(f"{name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     shutil.copytree(
-        out / "train" / name / "checkpoints" / "last" / "pretrained_model",
+        folder / "checkpoints" / "last" / "pretrained_model",
         partial,
         ignore=shutil.ignore_patterns("train_config.json"),
     )
@@ -111,6 +112,8 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="print the training commands and do nothing")
     parser.add_argument("--trials", type=int, default=10, help="resets of each task that are tried; 0: none")
     args = parser.parse_args()
+    if not CONFIGS.is_dir():
+        parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
     if args.print:
         for name in args.only:
             print(shlex.join(["lerobot-train", *training_arguments(name, args.out)]))
