@@ -8,7 +8,8 @@ What robosuite 1.4 offers, and what is made of it here:
   outside is unreachable.
 - It controls torques and never solves inverse kinematics: a goal that the arm cannot reach is simply pulled
   at. So the paper's test, inverse kinematics, is done here, on robosuite's own model: damped least squares
-  from the present posture to the goal position, under the joint limits of the model, the orientation kept.
+  from the present posture to the goal position, under the joint limits of the model, the orientation kept as
+  far as that goes. A joint that would leave its range is held there and the others go on.
 - `Robot.check_q_limits` only says that some joint is within 0.1 rad of a limit, where the arm still works.
 """
 
@@ -21,8 +22,9 @@ TOLERANCE_M = 0.005
 """Largest remaining distance of a goal that counts as reached: a tenth of a full command."""
 _ITERATIONS = 20
 _DAMPING = 0.02
-_TURN_WEIGHT = 0.1
-"""Metres that one radian of turned hand counts as: the position comes first."""
+_TURN_WEIGHT = 0.02
+"""Metres that one radian of turned hand counts as: the position comes first. With 0.1 the iteration sticks in
+a stretched posture, and places that the arm has just come from count as out of reach."""
 
 
 class ArmReach:
@@ -77,6 +79,19 @@ class ArmReach:
             mujoco.mj_jacSite(self._model, data, jacobian_p, jacobian_r, self._site)
             rows = np.concatenate([jacobian_p, _TURN_WEIGHT * jacobian_r])[:, self._dofs]
             error = np.concatenate([off, _TURN_WEIGHT * turned])
-            step = rows.T @ np.linalg.solve(rows @ rows.T + _DAMPING**2 * np.eye(6), error)
-            q = np.clip(q + step, self._low, self._high)
+            q = self._improved(q, rows, error)
         return False
+
+    def _improved(self, q: np.ndarray, rows: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """One damped step within the limits; joints that it would push beyond theirs are held and the step is
+        taken with the rest."""
+        free = np.ones(len(q), dtype=bool)
+        for _ in q:
+            moved = rows * free
+            step = moved.T @ np.linalg.solve(moved @ moved.T + _DAMPING**2 * np.eye(6), error)
+            better = np.clip(q + step, self._low, self._high)
+            held = free & (better != q + step) & (np.abs(better - q) < 1e-9)
+            if not held.any():
+                break
+            free &= ~held
+        return better
