@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -138,6 +139,39 @@ def test_the_same_rows_as_lerobots_rollout(dataset, checkpoints, monitor, tmp_pa
         wanted = {"rollback"} if mode.endswith("reversion") else {"correction"}
         wanted |= {"monitor"} if mode.startswith("monitor") else set()
     assert kinds == wanted
+
+
+def test_a_person_at_the_page_takes_over_under_both_evaluators(
+    dataset, checkpoints, monitor, tmp_path, monkeypatch
+):
+    """They drive three steps forward and hand back; by the page's own websocket."""
+    from lerobot_roborecover.build.teleop.client import Client, TeleopRefusal
+    from lerobot_roborecover.build.teleop.takeover import Takeover
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    made, taker = composite(checkpoints, "human"), Takeover(0)
+    made[0].director._driver = taker
+
+    def person() -> None:
+        with Client(taker.address) as client:
+            while True:
+                try:
+                    client.ask("status")
+                    if client.status.get("step", 0) >= 3:
+                        client.ask("hand_back")
+                    else:
+                        client.hold([1.0, 0, 0, 0, 0, 0])
+                except TeleopRefusal:  # between two trials
+                    continue
+
+    threading.Thread(target=person, daemon=True).start()
+    for rows in (
+        stock_rows(dataset, tmp_path / "stock.jsonl", made, "human"),
+        engine_rows(dataset, tmp_path / "fast.jsonl", made, "human", slots=1),
+    ):
+        assert all(r.reason == "" for r in rows)
+        steps = [e["steps"] for r in rows for e in r.interventions if e["kind"] == "takeover"]
+        assert max(steps) >= 3, "some takeovers end by hand and not with their trial"
 
 
 def test_a_trigger_never_reaches_another_slot(dataset, checkpoints, monitor, tmp_path):
