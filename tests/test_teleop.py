@@ -19,6 +19,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from lerobot_roborecover.build.candidates import read_candidates
+from lerobot_roborecover.build.film import read_film
 from lerobot_roborecover.build.funnel import Decision, read_decisions, record_decisions
 from lerobot_roborecover.build.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.build.teleop.controls import AXES, controls_of
@@ -197,7 +198,7 @@ def test_a_rollout_is_continued_from_any_of_its_steps(tmp_path):
 def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_path):
     out, said = tmp_path / "set", []
     folder = recordings_folder(out)
-    options = ("fake", {}, 32, said.append)
+    options = ("fake", {}, 32, said.append, 4)
     check_open(out)
     with cockpit(folder) as found, Client(found) as client:
         client.start("push-left", seed=4)
@@ -216,6 +217,9 @@ def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_pa
     assert {c.source.value for c in made.candidates} == {"human"}
     assert [(s.step, s.by, s.stage) for s in made.candidates[0].suggestions] == [(5, "operator", "Approach")]
     assert made.row(0).driver == "ann"
+    # Who renders its frames again (`validate`) does as was done here.
+    film = read_film(made.row(0).provenance, "here")
+    assert (film.every, film.options["observation_size"]) == (4, 32)
     saved = read_recording(store.paths()[0])
     assert made.actions(0).tobytes() == saved.actions.tobytes()
     assert (made.steps(0).bodies["puck"] == saved.bodies["puck"]).all()

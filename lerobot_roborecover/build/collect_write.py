@@ -26,6 +26,7 @@ from lerobot_roborecover.build.collect_crew import failed, in_order
 from lerobot_roborecover.build.collect_judge import Verdict
 from lerobot_roborecover.build.collect_record import Record, read_record, record_path
 from lerobot_roborecover.build.collect_server import Filmed, FilmJob
+from lerobot_roborecover.build.film import Film
 from lerobot_roborecover.build.funnel import Decision, record_decisions
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
@@ -204,11 +205,10 @@ def _films(
             )
             continue
         record = read_record(record_path(writing.records, v.scenario.id))
-        filmed = {"every": writing.film_every, "options": dict(writing.film_options)}
-        yield _recording(v, record, film, filmed)
+        yield _recording(v, record, film, Film(writing.film_every, writing.film_options))
 
 
-def _recording(v: Verdict, record: Record, film: Filmed, filmed: Mapping[str, Any]) -> Recording:
+def _recording(v: Verdict, record: Record, film: Filmed, filmed: Film) -> Recording:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     scenario = v.scenario
@@ -221,7 +221,7 @@ def _recording(v: Verdict, record: Record, film: Filmed, filmed: Mapping[str, An
             frames=(to_frame(scenario.platform, o) for o in film.observations),
             success=False,
             reset=record.reset,
-            provenance={"collect": {**(v.notes or {}), "film": filmed}},
+            provenance={"collect": {**(v.notes or {}), "film": filmed.note()}},
         ),
         record.steps,
         *((v.exclusion.reason, v.exclusion.detail, f"rule {v.exclusion.rule}") if v.exclusion else ()),

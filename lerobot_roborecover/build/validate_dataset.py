@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.build.candidates import CandidateSet, read_candidates
+from lerobot_roborecover.build.film import Film, read_film
 from lerobot_roborecover.build.funnel import STAGES, Decision, read_decisions
 from lerobot_roborecover.build.isolated import Crash, run_isolated
 from lerobot_roborecover.build.journal import Journal
@@ -312,18 +313,16 @@ def _drawn(name: str, trial: PolicyTrial, options: Mapping[str, Any]) -> DrawnRu
     return DrawnRun(name, row.trial, trial.actions, row.success, row.options.get("control_mode"), own)
 
 
-def _film_options(film: Mapping[str, Any], request: ValidationRequest) -> dict[str, Any]:
+def _film_options(film: Film, request: ValidationRequest) -> dict[str, Any]:
     """Simulator options that a rollout was filmed with, but for those that the request names itself."""
     if not request.rule.frames:
         return {}
     named = {option.split("=")[0] for option in request.env}
-    given = dict(film.get("options") or {})
-    return {k: v for k, v in given.items() if k in _FILM_OPTIONS and k not in named}
+    return {k: v for k, v in film.options.items() if k in _FILM_OPTIONS and k not in named}
 
 
-def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Rollout | None, Mapping[str, Any]]:
-    """The rollout that a scenario was made from, around its recovery point, and how it was filmed
-    (`collect_write`)."""
+def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Rollout | None, Film]:
+    """The rollout that a scenario was made from, around its recovery point, and how it was filmed."""
     from lerobot_roborecover.build.validation_frames import TAIL
 
     for found in sets:
@@ -338,18 +337,10 @@ def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Rollout 
             )
         last = min(step + TAIL, len(actions))
         around = range(max(step - KEPT + 1, 0), last + 1)
-        notes = found.row(episode).provenance.get("collect")
-        film = notes.get("film") if isinstance(notes, Mapping) else None
-        film = film if isinstance(film, Mapping) else {}
-        every = film.get("every", 1)
-        if type(every) is not int or every < 1 or not isinstance(film.get("options", {}), Mapping):
-            raise ScenarioError(
-                f"{found.root}: candidate {scenario.id} says it was filmed {str(film)[:200]}; collect it "
-                "again"
-            )
+        film = read_film(found.row(episode).provenance, f"{found.root}: candidate {scenario.id}")
         poses = {s: steps.poses_at(s) for s in around}
-        return Rollout(poses, actions[step:last], len(actions), every), film
-    return None, {}
+        return Rollout(poses, actions[step:last], len(actions), film.every), film
+    return None, Film()
 
 
 def _key(job: ReplayJob, originals: str) -> str:

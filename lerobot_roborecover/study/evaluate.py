@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
@@ -18,6 +19,8 @@ from lerobot_roborecover.study.commands import Arm, arms, report_command
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import Comparison, compare, outcomes_of, read_outcomes
 
+DONE_FILE = "done.json"
+"""Beside the log of an arm that has finished: the command that did it."""
 _SHOWN_LINES = 12
 
 
@@ -54,8 +57,11 @@ def evaluate(
     ids = scenario_ids(study, every)
     todo = list(arms(study, out, ids if every > 1 else (), slots))
     for number, arm in enumerate(todo, 1):
-        began = time.monotonic()
-        run_command(arm.argv, arm.out / "output.log", study)
+        began, done = time.monotonic(), arm.out / DONE_FILE
+        same = json.dumps([*arm.argv, ids])
+        if not (done.exists() and done.read_text() == same):
+            run_command(arm.argv, arm.out / "output.log", study)
+            done.write_text(same)
         rows = len(ids) * arm.trials
         say(f"[{number}/{len(todo)}] {arm.label}: {rows} trials, {time.monotonic() - began:.0f} s")
     return todo

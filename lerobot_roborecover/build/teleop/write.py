@@ -18,6 +18,7 @@ import numpy as np
 from lerobot_roborecover.build.annotate.votes import votes_folder
 from lerobot_roborecover.build.candidates import UNPERTURBED, Candidate, Steps, Suggestion
 from lerobot_roborecover.build.candidates_write import Recording, merge_candidates, write_candidates
+from lerobot_roborecover.build.film import Film
 from lerobot_roborecover.build.funnel import DECISIONS_FILE, read_decisions
 from lerobot_roborecover.build.teleop.store import Recorded, Store, read_recording
 from lerobot_roborecover.datasets.schema import FOLDER
@@ -98,13 +99,14 @@ def write_dataset(
         say(f"{dataset} holds all {len(paths)} recordings")
         return True
     if missing:
-        simulator = make_simulator(platform, **{**options, **view_options(platform, size)})
+        seen = {**options, **view_options(platform, size)}
+        simulator, film = make_simulator(platform, **seen), Film(film_every, seen)
         try:
             done = len(paths) - sum(len(group) for group, _ in missing)
             for group, part in missing:
                 recordings = [read_recording(path) for path in group]
                 say(f"rendering {done + 1} to {done + len(group)} of {len(paths)}")
-                _write_part(part, recordings, simulator, film_every)
+                _write_part(part, recordings, simulator, film)
                 done += len(group)
         finally:
             simulator.close()
@@ -120,7 +122,7 @@ def _part_of(folder: Path, group: list[Path]) -> Path:
     return folder / f"part-{first}-{last}"
 
 
-def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, film_every: int) -> None:
+def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, film: Film) -> None:
     versions = simulator.fingerprint()
     for recorded in recordings:
         if dict(recorded.versions) != versions:
@@ -130,14 +132,14 @@ def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, fi
             )
     write_candidates(
         part,
-        (_as_candidate(recorded, simulator, film_every) for recorded in recordings),
+        (_as_candidate(recorded, simulator, film) for recorded in recordings),
         fps=round(simulator.control_hz),
         versions=versions,
         description="Driven by hand with `roborecover teleop`.",
     )
 
 
-def _as_candidate(recorded: Recorded, simulator: Simulator, film_every: int) -> Recording:
+def _as_candidate(recorded: Recorded, simulator: Simulator, film: Film) -> Recording:
     count, mark = len(recorded.actions), recorded.mark
     error_m = _replay_error_m(recorded, simulator)
     reason, detail = recorded.lacks, ""
@@ -154,10 +156,10 @@ def _as_candidate(recorded: Recorded, simulator: Simulator, film_every: int) -> 
             task=recorded.task,
             driver=recorded.operator,
             actions=recorded.actions,
-            frames=_frames(recorded, simulator, film_every),
+            frames=_frames(recorded, simulator, film.every),
             success=proven or bool(recorded.solved[-1]),
             reset=recorded.reset,
-            provenance={"teleop": dict(recorded.notes)},
+            provenance={"teleop": {**recorded.notes, "film": film.note()}},
         ),
         Steps(recorded.bodies, recorded.solved, np.full(count, UNPERTURBED, np.int8)),
         exclusion=reason,

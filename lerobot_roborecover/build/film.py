@@ -1,0 +1,43 @@
+"""How a candidate was filmed, as its provenance says: whoever renders its frames again must do likewise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot_roborecover.scenario import ScenarioError
+
+_FOLDERS = ("assets_dir", "robotwin_root")
+"""Options that name folders of one machine."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Pictures of one rollout."""
+
+    every: int = 1
+    """Steps from one picture to the next; the last one stands until then."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the simulator that filmed."""
+
+    def note(self) -> dict[str, Any]:
+        """For the provenance, under `film`."""
+        return {"every": self.every, "options": {k: v for k, v in self.options.items() if k not in _FOLDERS}}
+
+
+def read_film(provenance: Mapping[str, Any], where: str) -> Film:
+    """What a rollout's provenance says, in the notes of whoever recorded it; every step where it is silent.
+
+    Raises:
+        ScenarioError: the note is none of `Film.note`'s.
+    """
+    for notes in provenance.values():
+        found = notes.get("film") if isinstance(notes, Mapping) else None
+        if found is None:
+            continue
+        every = found.get("every", 1) if isinstance(found, Mapping) else None
+        if type(every) is not int or every < 1 or not isinstance(found.get("options", {}), Mapping):
+            raise ScenarioError(f"{where} says it was filmed {str(found)[:200]}; record it again")
+        return Film(every, dict(found.get("options", {})))
+    return Film()
