@@ -165,7 +165,8 @@ class Chain:
         )  # fmt: skip
         rejects = Path(config.validate.rejects) if config.validate.rejects else None
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"
-        looked = [file_sha256(p) for p in (rejects, people) if p is not None and p.is_file()]
+        # `validate` itself leaves an empty record of rejections behind.
+        looked = [file_sha256(p) for p in (rejects, people) if p and p.is_file() and p.stat().st_size]
         yield Stage(
             "validate", "validate", places.validated, [_options(config.validate), looked],
             lambda: self._command(commands.validate_command(config, places)),

@@ -94,9 +94,9 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
                 mouse = SpaceMouse(desk.pilot, config.spacemouse)
                 mouse.start()
             token = kept_tokens("teleop", config.dataset, [operator])[operator]
-            say(f"{operator}: {len(config.starts)} starts  http://{HOST}:{port}/{NAME}/?token={token}")
-            say(f"recordings are kept in {store.folder}; Ctrl-C stops and writes {config.dataset}")
-            try:
+            try:  # from the first line on: who reads the address may interrupt at once
+                say(f"{operator}: {len(config.starts)} starts  http://{HOST}:{port}/{NAME}/?token={token}")
+                say(f"recordings are kept in {store.folder}; Ctrl-C stops and writes {config.dataset}")
                 make_server(make_app(Cockpit(token, own_hosts(port), hub, desk.pilot))).run(
                     sockets=[listener]
                 )
