@@ -21,8 +21,10 @@ def driving(out, *more: str, port: int = 0, end: int = signal.SIGKILL):
     command = [sys.executable, "-m", "lerobot_roborecover.cli.main", "teleop", str(out), "--platform=fake"]
     command += ["--operator=ann", "--view=32", f"--port={port}", *more]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "XDG_STATE_HOME": str(out.parent)}
-    )
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "XDG_STATE_HOME": str(out.parent)},
+        # A shell has its background jobs ignore it, and this may be one's child.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     try:
         yield process, process.stdout.readline().split()[-1]
     finally:
