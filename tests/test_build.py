@@ -13,9 +13,9 @@ import yaml
 from lerobot_roborecover.build.annotate.votes import SCHEMA_VERSION as VOTES_SCHEMA
 from lerobot_roborecover.build.annotate.votes import Vote
 from lerobot_roborecover.build.candidates import read_candidates
-from lerobot_roborecover.build.chain import Chain, Waiting
-from lerobot_roborecover.build.chain_config import read_config
-from lerobot_roborecover.build.chain_summary import markdown
+from lerobot_roborecover.build.chain.config import read_config
+from lerobot_roborecover.build.chain.stages import Chain, Waiting
+from lerobot_roborecover.build.chain.summary import markdown
 from lerobot_roborecover.build.funnel import Decision, FunnelRow, record_decisions
 from lerobot_roborecover.build.journal import Journal
 from lerobot_roborecover.cli.main import main
@@ -119,7 +119,7 @@ def stand_in(tmp_path, monkeypatch):
     from candidate_files import candidate_dataset
 
     monkeypatch.setattr(
-        "lerobot_roborecover.build.chain.merge_candidates",
+        "lerobot_roborecover.build.chain.stages.merge_candidates",
         lambda folder, sources: shutil.copytree(sources[0], folder),
     )
     candidate_dataset(tmp_path / "rollouts", 3)

@@ -9,19 +9,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.build import collect_exclusions as rules
 from lerobot_roborecover.build.candidates import PERTURBED, UNPERTURBED, UNREACHABLE, Steps
-from lerobot_roborecover.build.collect_judge import TOUCHED_TILT_DEG, Judging, scene_touched, verdict
-from lerobot_roborecover.build.collect_record import (
+from lerobot_roborecover.build.collect import exclusions as rules
+from lerobot_roborecover.build.collect.judge import (
+    TOUCHED_TILT_DEG,
+    Judging,
+    scene_touched,
+    verdict,
+)
+from lerobot_roborecover.build.collect.record import (
     Record,
     RecorderSettings,
     read_record,
     record_path,
     rollout_id,
 )
-from lerobot_roborecover.build.collect_rollouts import Ended, RolloutBook, run_expert, twin_of
-from lerobot_roborecover.build.collect_server import SERVER, CollectServer, FilmJob, More
-from lerobot_roborecover.build.collect_starts import (
+from lerobot_roborecover.build.collect.rollouts import Ended, RolloutBook, run_expert, twin_of
+from lerobot_roborecover.build.collect.server import SERVER, CollectServer, FilmJob, More
+from lerobot_roborecover.build.collect.starts import (
     Starts,
     all_tasks,
     choose_tasks,
@@ -171,7 +176,7 @@ def test_perturbation_is_the_papers_and_stops_where_the_platform_cannot_follow(t
         def __call__(self, _t):
             return near_wall
 
-    import lerobot_roborecover.build.collect_server as server
+    import lerobot_roborecover.build.collect.server as server
 
     original = server.make_driver
     server.make_driver = lambda *_: Straight()

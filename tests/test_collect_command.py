@@ -7,7 +7,7 @@ import pytest
 from factories import save_policy
 
 from lerobot_roborecover.build.candidates import PERTURBED, UNREACHABLE, read_candidates
-from lerobot_roborecover.build.collect_record import read_record
+from lerobot_roborecover.build.collect.record import read_record
 from lerobot_roborecover.build.funnel import funnel, read_decisions
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.scenario import Reset, Task
@@ -47,7 +47,7 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
     assert {c.source for c in found.candidates} == {"perturbed"}
     assert (found.steps(0).perturbation == PERTURBED).sum() > 10
 
-    from lerobot_roborecover.build import collect_write
+    from lerobot_roborecover.build.collect import write as collect_write
 
     original, written = collect_write.write_candidates, []
 
@@ -146,8 +146,13 @@ def test_something_else_in_the_folder_is_left_alone(tmp_path, capsys):
 def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
     from test_collect import ask
 
-    from lerobot_roborecover.build.collect_server import CollectServer, FilmJob
-    from lerobot_roborecover.build.collect_starts import Starts, all_tasks, choose_tasks, make_units
+    from lerobot_roborecover.build.collect.server import CollectServer, FilmJob
+    from lerobot_roborecover.build.collect.starts import (
+        Starts,
+        all_tasks,
+        choose_tasks,
+        make_units,
+    )
     from lerobot_roborecover.env.episode import SlotConfig
 
     tasks = choose_tasks(all_tasks("metaworld"), ["reach-wall-v3", "push-v3"])

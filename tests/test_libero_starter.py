@@ -87,8 +87,8 @@ def test_handoffs_are_identical_by_replay_and_by_snapshot(scenarios, simulator):
 @pytest.mark.libero
 @pytest.mark.slow
 def test_a_recipe_makes_its_scenario_again(scenarios, simulator):
-    from lerobot_roborecover.build.libero_recipes import RECIPES
-    from lerobot_roborecover.build.libero_starter import digest, prove, roll_out
+    from lerobot_roborecover.build.libero.recipes import RECIPES
+    from lerobot_roborecover.build.libero.starter import digest, prove, roll_out
 
     assert [r.id for r in RECIPES] == [s.id for s in scenarios]
     assert [digest(r) for r in RECIPES] == [s.provenance["recipe"] for s in scenarios]

@@ -16,7 +16,7 @@ GOAL = np.array([0.0, 0.9, 0.02])
 
 def trace(hand, puck, held, *, turn_deg=0.0, other=None, task="push-v3"):
     """A trace from functions of the step; `turn_deg` tips the object over at step 60."""
-    from lerobot_roborecover.build.metaworld_labels import Trace
+    from lerobot_roborecover.build.metaworld.labels import Trace
 
     made = Trace(task)
     half = np.deg2rad(turn_deg) / 2
@@ -32,7 +32,7 @@ def trace(hand, puck, held, *, turn_deg=0.0, other=None, task="push-v3"):
 
 
 def found(made):
-    from lerobot_roborecover.build.metaworld_labels import recovery_point
+    from lerobot_roborecover.build.metaworld.labels import recovery_point
 
     return recovery_point(made)
 

@@ -142,7 +142,7 @@ def test_bodies_names_what_moves_and_sees_a_hinge_turn(simulator):
 
 
 def test_marks_are_the_handled_point_and_where_it_belongs(simulator):
-    from lerobot_roborecover.build.metaworld_experts import expert
+    from lerobot_roborecover.build.metaworld.experts import expert
 
     for name, body in (
         ("basketball-v3", "bsktball"),
@@ -171,7 +171,7 @@ def test_steps_beyond_500_neither_raise_nor_reset(simulator):
 
 
 def test_success_is_the_last_steps_and_false_after_a_reset(simulator):
-    from lerobot_roborecover.build.metaworld_experts import expert
+    from lerobot_roborecover.build.metaworld.experts import expert
 
     simulator.reset(task("reach-v3"), Reset(seed=3))
     act = expert(simulator, "reach-v3")

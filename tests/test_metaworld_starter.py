@@ -61,7 +61,7 @@ def test_every_handoff_is_identical_after_the_others(shipped):
 
 def test_a_recorded_proof_still_recovers(shipped):
     """One scenario per proving controller; the others differ in nothing but the seed."""
-    from lerobot_roborecover.build.metaworld_experts import expert, patient_expert
+    from lerobot_roborecover.build.metaworld.experts import expert, patient_expert
 
     simulator = make_simulator("metaworld", obs_type="state")
     seen = set()
@@ -86,7 +86,7 @@ def test_a_recorded_proof_still_recovers(shipped):
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_the_policy_loads_as_lerobot_eval_loads_it_and_solves_a_clean_start():
-    from lerobot_roborecover.build.metaworld_experts import LearnedPolicy, task_named
+    from lerobot_roborecover.build.metaworld.experts import LearnedPolicy, task_named
     from lerobot_roborecover.scenario import Reset
 
     steps = json.loads((POLICY / "policy_preprocessor.json").read_text())["steps"]

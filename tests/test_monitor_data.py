@@ -13,7 +13,7 @@ from factories import fake_scenario, save_policy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.build.monitor_choice import (
+from lerobot_roborecover.build.monitor.choice import (
     BALANCED,
     NATURAL,
     TRAIN,
@@ -23,7 +23,7 @@ from lerobot_roborecover.build.monitor_choice import (
     from_rollouts,
     split_scenarios,
 )
-from lerobot_roborecover.build.monitor_data import STEP, check_disjoint, write_monitor_data
+from lerobot_roborecover.build.monitor.data import STEP, check_disjoint, write_monitor_data
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.trajectories import LABEL, ScenarioLink, read_trajectories
 from lerobot_roborecover.scenario import ScenarioError

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from factories import fake_scenario
 
-from lerobot_roborecover.build.monitor_choice import (
+from lerobot_roborecover.build.monitor.choice import (
     BALANCED,
     NATURAL,
     TRAIN,
@@ -22,7 +22,7 @@ from lerobot_roborecover.build.monitor_choice import (
     DataOptions,
     choose,
 )
-from lerobot_roborecover.build.monitor_data import write_monitor_data
+from lerobot_roborecover.build.monitor.data import write_monitor_data
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
 from lerobot_roborecover.interventions.monitor_interface import Monitor

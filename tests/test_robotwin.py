@@ -55,7 +55,7 @@ def simulator():
 
 def solution(simulator, task: Task = STACK, seed: int = 3) -> np.ndarray:
     """(T, 14) the expert's actions from a reset to success."""
-    from lerobot_roborecover.build.robotwin_expert import BlockExpert
+    from lerobot_roborecover.build.robotwin.expert import BlockExpert
 
     simulator.reset(task, Reset(seed=seed))
     actions = []

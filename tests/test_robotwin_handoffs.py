@@ -35,7 +35,7 @@ def simulator():
 @pytest.fixture(scope="module")
 def carried(simulator):
     """A scenario whose handoff is in mid-carry, and the actions that follow it."""
-    from lerobot_roborecover.build.robotwin_expert import BlockExpert
+    from lerobot_roborecover.build.robotwin.expert import BlockExpert
 
     simulator.reset(TASK, Reset(seed=3))
     actions, handoff = [], None
@@ -104,7 +104,7 @@ for scenario in reversed(list(load_scenarios("robotwin_starter"))):
 
 
 def test_the_starter_set_is_large_enough_and_as_its_recipes_say():
-    from lerobot_roborecover.build.robotwin_recipes import FAULTS, RECIPES
+    from lerobot_roborecover.build.robotwin.recipes import FAULTS, RECIPES
 
     assert {s.source.value for s in SHIPPED} == {"natural", "perturbed"}
     assert len([s for s in SHIPPED if s.provenance["moved_m"]]) >= 6, "scenarios in which something was moved"
@@ -121,7 +121,7 @@ def test_the_starter_set_is_large_enough_and_as_its_recipes_say():
 
 @on_standin
 def test_the_command_that_makes_the_starter_set(tmp_path, capsys):
-    from lerobot_roborecover.build.robotwin_starter import main
+    from lerobot_roborecover.build.robotwin.starter import main
 
     out = tmp_path / "set"
     assert main(["--out", str(out), "--only", "4-drop", "--robotwin-root", ROOT, "--jobs", "1"]) == 0

@@ -18,14 +18,14 @@ from hypothesis import strategies as st
 from trial_rows import trial_row
 
 from lerobot_roborecover.build.funnel import Decision, funnel, read_decisions, record_decisions
-from lerobot_roborecover.build.screening import (
+from lerobot_roborecover.build.screen.runs import forget_trials, parse_policies, take_trials
+from lerobot_roborecover.build.screen.screening import (
     ScreenRule,
     format_histogram,
     format_policies,
     histogram,
     screen,
 )
-from lerobot_roborecover.build.screening_runs import forget_trials, parse_policies, take_trials
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore

@@ -71,8 +71,8 @@ class Recorder:
     ],
 )
 def test_a_deviation_is_what_the_rules_call_it(task, way):
-    from lerobot_roborecover.build.metaworld_deviations import DEVIATIONS, Hand
-    from lerobot_roborecover.build.metaworld_experts import expert, task_named
+    from lerobot_roborecover.build.metaworld.deviations import DEVIATIONS, Hand
+    from lerobot_roborecover.build.metaworld.experts import expert, task_named
     from lerobot_roborecover.simulators.metaworld import MetaworldSimulator
 
     simulator = MetaworldSimulator(obs_type="state")

@@ -22,8 +22,8 @@ pytestmark = [pytest.mark.metaworld, pytest.mark.lerobot]
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory) -> Path:
     """Three short episodes of made-up numbers."""
-    from lerobot_roborecover.build.metaworld_dataset import Episode, create_dataset, save_episode
-    from lerobot_roborecover.build.metaworld_experts import task_named
+    from lerobot_roborecover.build.metaworld.dataset import Episode, create_dataset, save_episode
+    from lerobot_roborecover.build.metaworld.experts import task_named
 
     root = tmp_path_factory.mktemp("study") / "demonstrations"
     dataset, rng = create_dataset(root), np.random.default_rng(0)
@@ -40,7 +40,7 @@ def test_batches_from_memory_are_the_dataset_s(demonstrations, episodes, monkeyp
     from lerobot.datasets.dataset_reader import DatasetReader
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_roborecover.build.frames_in_memory import frames_in_memory
+    from lerobot_roborecover.build.metaworld.frames_in_memory import frames_in_memory
 
     deltas = {"action": [i / 80 for i in range(12)], "observation.state": [-1 / 80, 0.0]}
     dataset = LeRobotDataset("a/b", root=demonstrations, episodes=episodes, delta_timestamps=deltas)
@@ -65,7 +65,7 @@ def test_training_from_memory_is_training(name, demonstrations, tmp_path, monkey
     from lerobot.scripts.lerobot_train import main as lerobot_train
     from safetensors.numpy import load_file
 
-    from lerobot_roborecover.build.frames_in_memory import main as from_memory
+    from lerobot_roborecover.build.metaworld.frames_in_memory import main as from_memory
 
     weights = []
     for index, run in enumerate((lerobot_train, from_memory)):
@@ -84,7 +84,7 @@ def test_every_config_is_a_policy_s():
     from lerobot.configs.train import TrainPipelineConfig
 
     import lerobot_roborecover.plugin  # noqa: F401
-    from lerobot_roborecover.build.study_policies import POLICIES
+    from lerobot_roborecover.build.metaworld.study_policies import POLICIES
 
     found = {}
     for file in sorted((ROOT / "policies" / "train" / "study").glob("*.yaml")):
@@ -96,8 +96,8 @@ def test_every_config_is_a_policy_s():
 
 
 def test_each_policy_learns_from_its_share_of_every_task():
-    from lerobot_roborecover.build.metaworld_dataset import STUDY_TASKS
-    from lerobot_roborecover.build.study_policies import EPISODES_PER_TASK, episodes
+    from lerobot_roborecover.build.metaworld.dataset import STUDY_TASKS
+    from lerobot_roborecover.build.metaworld.study_policies import EPISODES_PER_TASK, episodes
 
     assert len(set(STUDY_TASKS)) >= 15
     assert episodes("act") is None
@@ -110,7 +110,7 @@ def test_each_policy_learns_from_its_share_of_every_task():
 
 
 def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
-    from lerobot_roborecover.build import study_policies
+    from lerobot_roborecover.build.metaworld import study_policies
 
     commands = []
 
@@ -142,7 +142,7 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
 
 
 def test_the_table_adds_up():
-    from lerobot_roborecover.build.initial_success import Tried, table
+    from lerobot_roborecover.build.metaworld.initial_success import Tried, table
 
     lines = table(
         {
@@ -171,7 +171,7 @@ def test_the_shipped_policies_are_small_and_say_what_they_need():
 @pytest.mark.parametrize("name", IN_THE_PACKAGE)
 def test_a_shipped_policy_solves_starts(name):
     """Two of three easy starts: another processor may round a trial the other way."""
-    from lerobot_roborecover.build.initial_success import evaluate
+    from lerobot_roborecover.build.metaworld.initial_success import evaluate
 
     tried = evaluate(SHIPPED / name, ["coffee-push-v3", "pick-place-v3", "sweep-into-v3"], trials=1)
     assert sum(one.solved for one in tried.values()) >= 2

@@ -22,8 +22,9 @@ from trial_rows import trial_row
 from lerobot_roborecover.build.funnel import Decision, funnel, read_decisions, record_decisions
 from lerobot_roborecover.build.isolated import Crash, run_isolated
 from lerobot_roborecover.build.policy_trials import ACTIONS_FOLDER, actions_digest, actions_path
-from lerobot_roborecover.build.validate_dataset import ValidationRequest, validate_dataset
-from lerobot_roborecover.build.validation import (
+from lerobot_roborecover.build.validate.dataset import ValidationRequest, validate_dataset
+from lerobot_roborecover.build.validate.frames import Encoder, encoded, ssim, window
+from lerobot_roborecover.build.validate.validation import (
     Replays,
     RunReplay,
     ValidationRule,
@@ -32,7 +33,6 @@ from lerobot_roborecover.build.validation import (
     judge,
     replays_from,
 )
-from lerobot_roborecover.build.validation_frames import Encoder, encoded, ssim, window
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frames import LastFrames, _encode, last_frames

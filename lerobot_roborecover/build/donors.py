@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.build.monitor_frames import Film, Job, replayed
+from lerobot_roborecover.build.monitor.frames import Film, Job, replayed
 from lerobot_roborecover.build.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.env.trial_log import TrialRow

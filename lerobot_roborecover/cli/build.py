@@ -25,10 +25,10 @@ def run(args: argparse.Namespace) -> int:
     """Builds, writes the summary, and prints the funnel."""
     import shlex
 
-    from lerobot_roborecover.build.chain import Chain, Waiting
-    from lerobot_roborecover.build.chain_commands import publish_command
-    from lerobot_roborecover.build.chain_config import read_config
-    from lerobot_roborecover.build.chain_summary import write_summary
+    from lerobot_roborecover.build.chain.commands import publish_command
+    from lerobot_roborecover.build.chain.config import read_config
+    from lerobot_roborecover.build.chain.stages import Chain, Waiting
+    from lerobot_roborecover.build.chain.summary import write_summary
     from lerobot_roborecover.cli.main import main
 
     config = read_config(args.config)

@@ -75,7 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
 def pass_through(argv: Sequence[str]) -> int:
     """Parses, collects, and prints the table."""
     _quiet()
-    from lerobot_roborecover.build.collect import collect, describe, plan
+    from lerobot_roborecover.build.collect.collection import collect, describe, plan
 
     parser = build_parser()
     args, rest = parser.parse_known_args(_pairs(argv))
@@ -104,9 +104,9 @@ def _pairs(argv: Sequence[str]) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]):
-    from lerobot_roborecover.build.collect_judge import Judging
-    from lerobot_roborecover.build.collect_options import CollectOptions
-    from lerobot_roborecover.build.collect_starts import Starts, parse_numbers
+    from lerobot_roborecover.build.collect.judge import Judging
+    from lerobot_roborecover.build.collect.options import CollectOptions
+    from lerobot_roborecover.build.collect.starts import Starts, parse_numbers
     from lerobot_roborecover.env.options import OptionError
 
     policy, kind, env, policy_options = "", "", [], []

@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     """Makes the data and prints the counts."""
     import datasets
 
-    from lerobot_roborecover.build.monitor_choice import TRAIN, DataOptions
-    from lerobot_roborecover.build.monitor_request import MonitorRequest, make_monitor_data
+    from lerobot_roborecover.build.monitor.choice import TRAIN, DataOptions
+    from lerobot_roborecover.build.monitor.request import MonitorRequest, make_monitor_data
 
     datasets.disable_progress_bars()  # LeRobot's writer shows one per episode
     choice = DataOptions(

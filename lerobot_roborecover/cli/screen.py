@@ -63,9 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Screens, and prints the tables and the funnel."""
     from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.screen_dataset import ScreenRequest, screen_dataset
-    from lerobot_roborecover.build.screening import ScreenRule, format_histogram, format_policies
-    from lerobot_roborecover.build.screening_runs import parse_policies
+    from lerobot_roborecover.build.screen.dataset import ScreenRequest, screen_dataset
+    from lerobot_roborecover.build.screen.runs import parse_policies
+    from lerobot_roborecover.build.screen.screening import ScreenRule, format_histogram, format_policies
 
     policies, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
     rule = ScreenRule(args.trials, tuple(args.keep), args.max_invalid)

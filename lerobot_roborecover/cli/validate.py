@@ -49,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Validates, and prints the distribution and the funnel."""
     from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.validate_dataset import ValidationRequest, validate_dataset
-    from lerobot_roborecover.build.validation import ValidationRule, format_validation
+    from lerobot_roborecover.build.validate.dataset import ValidationRequest, validate_dataset
+    from lerobot_roborecover.build.validate.validation import ValidationRule, format_validation
 
     rule = ValidationRule(
         args.runs, args.seed, args.tolerance_mm, args.min_ssim, not args.no_frames, not args.no_outcomes

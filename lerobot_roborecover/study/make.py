@@ -66,12 +66,12 @@ def stages(out: Path) -> list[Stage]:
     return [
         Stage(
             "policies",
-            (("lerobot_roborecover.build.study_policies", "--out", str(out), "--trials", "0"),),
+            (("lerobot_roborecover.build.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
             out / "policies" / "diffusion_few",
         ),
         Stage(
             "driven",
-            (("lerobot_roborecover.build.scripted_operator", "--out", str(out / "driven")),),
+            (("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / "driven")),),
             out / "driven" / "meta" / "roborecover" / "candidates.json",
         ),
         Stage(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.monitor import MonitorFrames
-from lerobot_roborecover.build.monitor_data import STEP, check_disjoint
+from lerobot_roborecover.build.monitor.data import STEP, check_disjoint
 from lerobot_roborecover.datasets.trajectories import LABEL, ScenarioLink, TrajectorySet, read_trajectories
 from lerobot_roborecover.interventions.monitor.base import TASK, choose_features
 from lerobot_roborecover.scenario import ScenarioError

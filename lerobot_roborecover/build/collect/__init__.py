@@ -1,0 +1,1 @@
+"""Rollouts become candidates: starts, drivers, perturbation, recording, exclusions."""

@@ -1,0 +1,221 @@
+"""What is recorded of a rollout, and the simulator that records it while somebody else drives.
+
+The recorder stands between whoever drives and the simulator, in the simulator's own process, because that is
+where an action's perturbation can be tested for reach, step by step. A finished rollout is a file before the
+driver hears of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.build.candidates import PERTURBED, UNPERTURBED, UNREACHABLE, Steps
+from lerobot_roborecover.build.collect.starts import stream
+from lerobot_roborecover.build.rollout import PERTURBED_STEPS, perturb_translations
+from lerobot_roborecover.scenario import Pose, Reset, Scenario, ScenarioError
+from lerobot_roborecover.simulators.base import Simulator
+from lerobot_roborecover.simulators.limits import Workspace, limits_of
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """How rollouts are recorded; plain values, so that they travel to a worker."""
+
+    folder: str
+    """Where the records go."""
+    seed: int = 0
+    """Of the perturbation and of drivers that draw."""
+    expert: str = ""
+    """Name of the scripted driver; empty where a policy drives."""
+    perturbed_steps: int = PERTURBED_STEPS
+    """Leading interaction steps in which actions are perturbed."""
+
+
+@dataclass
+class Record:
+    """One rollout of T actions."""
+
+    reset: Reset
+    """With the fixtures' poses."""
+    actions: np.ndarray
+    """(T, A) float64, as executed."""
+    steps: Steps
+    margin_rad: np.ndarray
+    """(T + 1,) float64: distance of the arm's joints from their limits; NaN where nobody knows."""
+    workspace: Workspace | None
+    """Of the reset, where the simulator knows it."""
+    solved_after: int | None = field(init=False)
+    """Actions after which the task's predicate first held, or None."""
+
+    def __post_init__(self):
+        held = np.flatnonzero(self.steps.solved)
+        self.solved_after = int(held[0]) if len(held) else None
+
+
+def record_path(folder: str | os.PathLike[str], rollout_id: str) -> Path:
+    """File of a rollout's record."""
+    return Path(folder) / f"{rollout_id}.npz"
+
+
+def rollout_id(scenario: Scenario, twin: bool = False) -> str:
+    """Name of a rollout: the candidate's id, or that of its undisturbed twin."""
+    return f"{scenario.id}.twin" if twin else scenario.id
+
+
+def write_record(path: Path, record: Record) -> None:
+    """Writes a record, on disk when this returns."""
+    fixtures = {name: [*p.position_m, *p.quat_xyzw] for name, p in record.reset.fixtures.items()}
+    about = {
+        "schema": 1,
+        "bodies": list(record.steps.bodies),
+        "reset": {**asdict(replace(record.reset, fixtures={})), "fixtures": fixtures},
+        "workspace": None if record.workspace is None else asdict(record.workspace),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with open(temporary, "wb") as file:
+        np.savez_compressed(
+            file,
+            about=np.array(json.dumps(about)),
+            actions=record.actions,
+            poses=np.stack(list(record.steps.bodies.values())),
+            solved=record.steps.solved,
+            perturbation=record.steps.perturbation,
+            margin_rad=record.margin_rad,
+        )
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def read_record(path: Path) -> Record:
+    """Reads what `write_record` wrote.
+
+    Raises:
+        ScenarioError: the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays["about"]))
+        reset = dict(about["reset"])
+        reset["fixtures"] = {n: Pose(tuple(v[:3]), tuple(v[3:])) for n, v in reset["fixtures"].items()}
+        place = about["workspace"]
+        return Record(
+            Reset(**reset),
+            arrays["actions"],
+            Steps(
+                dict(zip(about["bodies"], arrays["poses"], strict=True)),
+                arrays["solved"],
+                arrays["perturbation"],
+            ),
+            arrays["margin_rad"],
+            None
+            if place is None
+            else Workspace(tuple(place["low_m"]), tuple(place["high_m"]), place["support_m"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as err:
+        raise ScenarioError(
+            f"{path} is not a rollout's record ({err!s:.200}). Delete it: the same command rolls out again"
+        ) from None
+
+
+class RecordingSimulator:
+    """A simulator that records, and perturbs where the plan says so; everything else is the simulator's.
+
+    Args:
+        simulator: of any platform.
+        settings: where to, and the perturbation.
+    """
+
+    snapshot_is_exact = False
+    """A restored snapshot would leave steps unrecorded."""
+
+    def __init__(self, simulator: Simulator, settings: RecorderSettings):
+        self.inner = simulator
+        self._settings = settings
+        self._limits = limits_of(simulator)
+        self._plan: Scenario | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "inner":  # while it is being made
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+    def plan(self, scenario: Scenario) -> None:
+        """Names the rollout that the next reset begins."""
+        self._plan = scenario
+
+    def reset(self, task: Any, reset: Reset) -> None:
+        """Begins a record."""
+        assert self._plan is not None, "reset without a plan"
+        notes = self._plan.provenance
+        self.inner.reset(task, reset)
+        self._reset = replace(reset, fixtures=dict(self.inner.fixtures()))
+        self._noise = None
+        if notes["perturbed"]:
+            self._noise = stream(self._settings.seed, "perturbation", task, reset, notes["trial"])
+        self._last = reset.settle_steps + task.horizon
+        self._actions: list[np.ndarray] = []
+        self._flags: list[int] = []
+        self._poses: list[np.ndarray] = []
+        self._solved: list[bool] = []
+        self._margins: list[float] = []
+        self._look()
+
+    def step(self, action: np.ndarray) -> None:
+        """Perturbs, executes in float64, records; writes the record with the last action."""
+        action, flag = self._disturbed(np.array(action, dtype=np.float64))
+        self.inner.step(action)
+        self._actions.append(action)
+        self._flags.append(flag)
+        self._look()
+        if len(self._actions) > self._reset.settle_steps and self.over:
+            self._write()
+
+    @property
+    def over(self) -> bool:
+        """Whether the task is solved or out of steps."""
+        return self._solved[-1] or len(self._actions) >= self._last
+
+    def _disturbed(self, action: np.ndarray) -> tuple[np.ndarray, int]:
+        t = len(self._actions) - self._reset.settle_steps
+        if self._noise is None or not 0 <= t < self._settings.perturbed_steps:
+            return action, UNPERTURBED
+        # Drawn whether or not it is executed: what comes later does not depend on reach.
+        noisy = perturb_translations(action, self._noise)
+        if self._limits is not None and not self._limits.reachable(noisy):
+            return action, UNREACHABLE
+        return noisy, PERTURBED
+
+    def _look(self) -> None:
+        bodies = self.inner.bodies()
+        if not self._poses:
+            self._names = list(bodies)
+        self._poses.append(np.array([[*bodies[n].position_m, *bodies[n].quat_xyzw] for n in self._names]))
+        self._solved.append(bool(self.inner.succeeded()))
+        self._margins.append(np.nan if self._limits is None else self._limits.joint_margin_rad())
+
+    def _write(self) -> None:
+        assert self._plan is not None
+        poses = np.stack(self._poses, axis=1)
+        record = Record(
+            self._reset,
+            np.stack(self._actions),
+            Steps(
+                dict(zip(self._names, poses, strict=True)),
+                np.array(self._solved),
+                np.array(self._flags, np.int8),
+            ),
+            np.array(self._margins),
+            None if self._limits is None else self._limits.workspace(),
+        )
+        twin = not self._plan.provenance["perturbed"] and self._plan.source == "perturbed"
+        write_record(record_path(self._settings.folder, rollout_id(self._plan, twin)), record)

@@ -1,0 +1,203 @@
+"""The two long parts of a collection, with their simulators: rolling out, and filming what is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from lerobot_roborecover.build.collect.judge import Verdict
+from lerobot_roborecover.build.collect.options import CollectOptions
+from lerobot_roborecover.build.collect.record import RecorderSettings, rollout_id
+from lerobot_roborecover.build.collect.rollouts import (
+    Ended,
+    RolloutBook,
+    run_expert,
+    run_policy,
+    twin_of,
+)
+from lerobot_roborecover.build.collect.server import SERVER
+from lerobot_roborecover.build.collect.write import Writing, write_collection
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.run import RunSpec
+from lerobot_roborecover.env.slots import SlotPool
+from lerobot_roborecover.evaluate.progress import ProgressLine
+from lerobot_roborecover.evaluate.sizes import usable_cores
+from lerobot_roborecover.scenario import Scenario, ScenarioError
+
+PARTS_FOLDER = "parts"
+
+
+class Count:
+    """How far something is, as `ProgressLine` asks."""
+
+    half_width = None
+
+    def __init__(self, done: int, total: int):
+        self.done, self.total, self.solved = done, total, 0
+        self.ended = 0
+
+    @property
+    def rate(self) -> float | None:
+        """Share of successes among those that ended in this run."""
+        return self.solved / self.ended if self.ended else None
+
+
+def _slot_count(options: CollectOptions) -> int:
+    return options.slots or usable_cores()
+
+
+def roll_out(
+    options: CollectOptions, env: Any, spec: RunSpec, units: Sequence[Scenario], book: RolloutBook
+) -> None:
+    """Runs what the book does not hold yet."""
+    passes = [(False, list(units))]
+    if options.judging.scene_touched_mm:
+        passes.append((True, [twin_of(s) for s in units]))
+    todo = [
+        (
+            twins,
+            [s for s in wanted if book.find(rollout_id(s, twins), retry_errors=options.retry_errors) is None],
+        )
+        for twins, wanted in passes
+    ]
+    total, left = sum(len(w) for _, w in passes), sum(len(t) for _, t in todo)
+    count, line = Count(total - left, total), ProgressLine("rollouts", detailed=True, unit="rollouts")
+    line.show(count)
+    if not left:
+        return
+
+    def on_end(ended: Ended) -> None:
+        book.add(ended)
+        count.done += 1
+        count.ended += 1
+        count.solved += ended.outcome == "success"
+        line.show(count)
+
+    settings = asdict(
+        RecorderSettings(str(book.records.resolve()), options.seed, options.expert, options.perturbed_steps)
+    )
+    slot = replace(spec.slot, server=SERVER, settings=settings, environment=_drawing(options, env))
+    pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
+    pool.acquire()
+    try:
+        host = _load_host(options, env) if options.policy else None
+        for twins, wanted in todo:
+            if options.expert:
+                run_expert(wanted, pool, _slot_count(options), on_end, twins=twins)
+            else:
+                run_policy(wanted, pool, _slot_count(options), host, options.seed, on_end, twins=twins)
+        line.show(count, final=True)
+    finally:
+        pool.release()
+
+
+def _drawing(options: CollectOptions, env: Any, *, films: bool = False) -> Mapping[str, str | None]:
+    """Where the workers draw, if they do."""
+    if not films and getattr(env, "obs_type", "state") == "state":
+        return {}
+    from lerobot_roborecover.env.render_device import egl_devices, render_environment
+
+    return render_environment("auto", options.device or "cpu", egl_devices())
+
+
+def _load_host(options: CollectOptions, env: Any) -> Any:
+    from lerobot.configs.policies import PreTrainedConfig
+
+    from lerobot_roborecover.env.intervention_options import POLICY_TYPE
+    from lerobot_roborecover.evaluate.runner import load_host
+    from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
+
+    find_file(options.policy, CONFIG_FILE)
+    overrides = [f"--{o.removeprefix('--')}" for o in options.policy_options]
+    overrides += [f"--device={options.device}"] if options.device else []
+    config = PreTrainedConfig.from_pretrained(options.policy, cli_overrides=overrides)
+    config.pretrained_path = Path(options.policy)
+    if config.type == POLICY_TYPE:
+        raise OptionError(
+            f"--policy.path={options.policy}: an intervention goes back in time and cannot be replayed as "
+            "one rollout; collect from its base policy"
+        )
+    runner = SimpleNamespace(max_batch=options.max_batch)
+    return load_host(
+        SimpleNamespace(
+            policy=config, env=env, rename_map=dict(options.rename_map), seed=options.seed, runner=runner
+        )
+    )
+
+
+def film_and_write(
+    options: CollectOptions,
+    spec: RunSpec,
+    book: RolloutBook,
+    kept: Sequence[Verdict],
+    dropped: Sequence[Any],
+    about: Mapping[str, Any],
+) -> None:
+    """Films what is kept, and writes the dataset.
+
+    Args:
+        options: of the collection.
+        spec: the env type's part of a run.
+        book: of the rollouts.
+        kept: candidates, in the order of their episodes.
+        dropped: decisions on all others.
+        about: content of `meta/roborecover/collect.json`.
+
+    Raises:
+        ScenarioError: nothing could be filmed, or the disk is full.
+    """
+    drawing = _drawing(options, None, films=True) if options.frames else {}
+    slot = replace(
+        spec.slot, server=SERVER, settings={}, environment=drawing, options=_film_options(options, spec),
+        control_mode=None,
+    )  # fmt: skip
+    pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
+    pool.acquire()
+    try:
+        (one,) = pool.slots(1)
+        one.send("fingerprint")
+        versions = one.receive()
+        if not isinstance(versions, dict):
+            raise ScenarioError(f"no simulator could be made to film with: {versions.message}")
+        films = {k: v for k, v in slot.options.items() if k not in ("assets_dir", "robotwin_root")}
+        writing = Writing(
+            records=book.records,
+            parts=book.work / PARTS_FOLDER,
+            pool=pool,
+            slots=_slot_count(options),
+            fps=round(pool.spaces()["hz"]),
+            versions=versions,
+            frames=f"{options.frames}/{options.film_every}",
+            film_every=options.film_every,
+            film_options=films,
+            part_size=options.part_size,
+            description=options.description,
+            license=options.license,
+        )
+        count, line = Count(0, len(kept)), ProgressLine("writing", detailed=True, unit="candidates")
+
+        def on_film(done: int) -> None:
+            count.done = done
+            line.show(count, final=done == len(kept))
+
+        write_collection(options.out, kept, dropped, writing, about, on_film)
+    except OSError as err:
+        raise ScenarioError(
+            f"{options.out} could not be written: {err}. Nothing that was finished is lost: make room, and "
+            "run the same command again"
+        ) from err
+    finally:
+        pool.release()
+
+
+def _film_options(options: CollectOptions, spec: RunSpec) -> dict[str, Any]:
+    """Options of the simulator that films: the policy's own, but for what is seen."""
+    changed: dict[str, Any] = {"obs_type": "pixels_agent_pos" if options.frames else "state"}
+    if options.frames and options.platform in ("libero", "metaworld"):
+        changed |= {"observation_height": options.frames, "observation_width": options.frames}
+    if options.frames and options.platform == "fake":
+        changed["observation_size"] = options.frames
+    return {**spec.slot.options, **changed}

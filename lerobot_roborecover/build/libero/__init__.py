@@ -1,0 +1,1 @@
+"""LIBERO: the scripted expert, recipes and the shipped set."""

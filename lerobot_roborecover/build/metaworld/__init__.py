@@ -1,0 +1,1 @@
+"""Meta-World: experts, demonstrations, labels, the shipped sets and policies."""

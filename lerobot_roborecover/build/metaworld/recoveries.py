@@ -1,0 +1,104 @@
+"""Recoveries of Meta-World tasks as a LeRobotDataset, for a donor policy that recovers better than the
+shipped one.
+
+From the recovery points of a starter working folder (other seeds than any scenario's) the patient scripted
+policy drives, which backs off and tries again; what it solves is kept, beside ordinary demonstrations.
+
+    python -m lerobot_roborecover.build.metaworld.starter --out WORK --first-seed 20000 --no-proof
+    python -m lerobot_roborecover.build.metaworld.recoveries --failures WORK --out DIR
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.build.metaworld.dataset import (
+    DEMO_TASKS,
+    FIRST_SEED,
+    Episode,
+    create_dataset,
+    demonstration,
+    record,
+    save_episode,
+)
+from lerobot_roborecover.build.metaworld.experts import patient_expert, task_named
+from lerobot_roborecover.scenario import Reset
+from lerobot_roborecover.simulators.metaworld import MetaworldSimulator
+
+_MAX_STEPS = 220
+"""Two attempts."""
+
+
+def recovery(
+    simulator: MetaworldSimulator, row: dict[str, Any], prefix: np.ndarray, seed: int
+) -> Episode | None:
+    """A recovery; None where it failed.
+
+    Args:
+        simulator: with any `obs_type`.
+        row: of the working folder's `points.jsonl`.
+        prefix: (t, 4) actions up to the recovery point.
+        seed: of the driver's jitter.
+    """
+    simulator.reset(task_named(row["task"]), Reset(seed=row["seed"]))
+    for action in prefix:
+        simulator.step(action)
+    act = patient_expert(simulator, row["task"], np.random.default_rng(seed))
+    return record(simulator, act, _MAX_STEPS)
+
+
+def recoveries(simulator: MetaworldSimulator, failures: Path) -> Iterator[tuple[str, Any]]:
+    """Task name and episode of each recovery point: at the point itself, and some steps earlier."""
+    rows = [json.loads(line) for line in (failures / "points.jsonl").read_text().splitlines()]
+    for row in rows:
+        if not row["step"]:
+            continue
+        actions = np.load(failures / "actions" / f"{row['key']}.npy")
+        for seed, earlier in enumerate((0, 15, 30)):
+            yield row["task"], recovery(simulator, row, actions[: max(row["step"] - earlier, 0)], seed)
+
+
+def write(root: Path, failures: Path, demonstrations_per_task: int) -> None:
+    """Writes the dataset; `root` must not exist."""
+    dataset = create_dataset(root)
+    simulator = MetaworldSimulator(obs_type="state")
+    kept = tried = 0
+    for name, episode in recoveries(simulator, failures):
+        tried += 1
+        if episode is not None:
+            save_episode(dataset, task_named(name), episode)
+            kept += 1
+    print(f"{kept} recoveries from {tried} attempts", flush=True)
+    for name in DEMO_TASKS:
+        found, seed = 0, FIRST_SEED
+        while found < demonstrations_per_task:
+            shaken_steps = 0 if found % 2 == 0 else 20 * (found % 7)
+            episode = demonstration(simulator, task_named(name), seed, shaken_steps)
+            seed += 1
+            if episode is not None:
+                save_episode(dataset, task_named(name), episode)
+                found += 1
+    dataset.finalize()
+    simulator.close()
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--failures", type=Path, required=True, help="working folder of metaworld_starter")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write; must not exist")
+    parser.add_argument("--demonstrations-per-task", type=int, default=30)
+    args = parser.parse_args()
+    write(args.out, args.failures, args.demonstrations_per_task)
+
+
+if __name__ == "__main__":
+    main()

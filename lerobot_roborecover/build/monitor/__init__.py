@@ -1,0 +1,1 @@
+"""Data for monitors: which frames, rendered from which continuations."""

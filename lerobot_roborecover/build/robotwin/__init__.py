@@ -1,0 +1,1 @@
+"""RoboTwin: the scripted expert, recipes and the shipped set."""

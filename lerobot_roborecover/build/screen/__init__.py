@@ -1,0 +1,1 @@
+"""Screening by policies: which scenarios are of intermediate difficulty."""

@@ -1,0 +1,1 @@
+"""Replays of screening runs against what was recorded, and the pages to look at."""
