@@ -32,7 +32,10 @@ def has_kernels(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return False
     try:
-        flags = next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), "")
+        with open(
+            cpuinfo, encoding="utf-8", errors="replace"
+        ) as file:  # a paragraph for each core: the first
+            flags = next((line for line in file if line.startswith("flags")), "")
     except OSError:
         return False
     return {"avx2", "fma"} <= set(flags.split())

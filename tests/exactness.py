@@ -44,6 +44,8 @@ def as_recorded(scenario: Scenario, handoff: Handoff) -> bool:
 
 def row_as_recorded(row: TrialRow) -> bool:
     """Whether a trial's handoff was."""
+    if PINNED:
+        return row.handoff_identical is True
     return max(row.handoff_eef_error_mm, row.handoff_object_error_mm) <= ROUNDING_MM[row.platform]
 
 

@@ -22,8 +22,9 @@ from trial_rows import trial_row
 from lerobot_roborecover.build.funnel import Decision, funnel, read_decisions, record_decisions
 from lerobot_roborecover.build.isolated import Crash, run_isolated
 from lerobot_roborecover.build.policy_trials import ACTIONS_FOLDER, actions_digest, actions_path
-from lerobot_roborecover.build.validate.dataset import ValidationRequest, validate_dataset
+from lerobot_roborecover.build.validate.dataset import validate_dataset
 from lerobot_roborecover.build.validate.frames import Encoder, encoded, ssim, window
+from lerobot_roborecover.build.validate.request import ValidationRequest
 from lerobot_roborecover.build.validate.validation import (
     Replays,
     RunReplay,

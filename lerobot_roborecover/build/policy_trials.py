@@ -11,11 +11,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.build.hosts import policy_config, policy_host
 from lerobot_roborecover.env.command_line import read_command_line
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial_log import TrialLog, TrialRow, read_trial_log, trial_key
@@ -153,15 +153,7 @@ def run_trials(
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
     """
-    from lerobot.configs.policies import PreTrainedConfig
-
-    from lerobot_roborecover.evaluate.runner import load_host
-    from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
-
-    find_file(policy, CONFIG_FILE)
-    overrides = [*policy_options, *([f"--device={device}"] if device else [])]
-    config = PreTrainedConfig.from_pretrained(policy, cli_overrides=overrides)
-    config.pretrained_path = Path(policy)
+    config = policy_config(policy, policy_options, device)
     named = ["roborecover-eval", f"--policy.path={policy}", f"--output_dir={folder}"]
     named += [f"--policy.{o.removeprefix('--')}" for o in policy_options]
     facts = replace(read_command_line(named), batch_size=None, n_episodes=trials)
@@ -175,11 +167,9 @@ def run_trials(
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
         if todo:
-            runner = SimpleNamespace(max_batch=max_batch)
-            wanted = SimpleNamespace(
-                policy=config, env=env, rename_map=dict(rename_map or {}), seed=seed, runner=runner
+            host = RecordingHost(
+                policy_host(config, env, rename_map=rename_map, seed=seed, max_batch=max_batch)
             )
-            host = RecordingHost(load_host(wanted))
             run.log = _KeepingLog(run.log, host, folder / ACTIONS_FOLDER)
             count = [len(units) - len(todo)]
 

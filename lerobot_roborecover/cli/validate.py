@@ -49,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Validates, and prints the distribution and the funnel."""
     from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.validate.dataset import ValidationRequest, validate_dataset
+    from lerobot_roborecover.build.validate.dataset import validate_dataset
+    from lerobot_roborecover.build.validate.request import ValidationRequest
     from lerobot_roborecover.build.validate.validation import ValidationRule, format_validation
 
     rule = ValidationRule(

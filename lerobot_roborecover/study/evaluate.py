@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.parent import end_with_parent
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.commands import Arm, arms, report_command
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import Comparison, compare, outcomes_of, read_outcomes
@@ -87,18 +83,13 @@ def run_command(argv: Sequence[str], log: Path, study: StudyDefinition) -> None:
         ScenarioError: it failed; the message has the end of its output.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    environment = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1", **os.environ, **study.environment}
     with log.open("ab") as stream:
-        done = subprocess.run(
-            [sys.executable, "-m", "lerobot_roborecover.cli.main", *argv],
-            stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, env=environment,
-            preexec_fn=partial(end_with_parent, os.getpid()),
-        )  # fmt: skip
-    if done.returncode:
+        status = run_module("lerobot_roborecover.cli.main", argv, study.environment, stream)
+    if status:
         shown = "\n".join(
             f"  {line}" for line in log.read_text(errors="replace").splitlines()[-_SHOWN_LINES:]
         )
         raise ScenarioError(
-            f"`roborecover {shlex.join(argv)}` ended with status {done.returncode}. The end of {log}:\n"
+            f"`roborecover {shlex.join(argv)}` ended with status {status}. The end of {log}:\n"
             f"{shown}\nRun the same command again to go on with what is left"
         )

@@ -10,22 +10,20 @@ import json
 import os
 import shlex
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from lerobot_roborecover.env.parent import end_with_parent
+from lerobot_roborecover.build.chain.config import ChainConfig, read_config
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.definition import StudyDefinition, write_definition
+from lerobot_roborecover.study.child import run_module
+from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
 
 POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 5, "diffusion_few": 5, "tdmpc": 1}
 """Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
-SCREENING = ("act", "tdmpc", "act_few", "diffusion_few")
-"""Policies of the screening (policies/build/metaworld_study.yaml)."""
+DRIVEN = {"driven1": "500-501", "driven2": "502-503"}
+"""Seeds of the scripted operator's recordings, by the chain's name for them."""
 BASE = "act"
 CHAIN, CHAIN_ROOT = Path("policies/build/metaworld_study.yaml"), "outputs/study"
 """The scenarios' recipe, and the folder that it works in unless told otherwise."""
@@ -54,14 +52,20 @@ class Stage:
     """Results of an interrupted run that the commands would refuse to write over."""
 
 
-def stages(out: Path) -> list[Stage]:
-    """The stages in their order; everything lies below `out`."""
+def stages(out: Path, chain: ChainConfig) -> list[Stage]:
+    """The stages in their order; everything lies below `out`.
+
+    Args:
+        out: working folder.
+        chain: how the scenarios are built (`chain_for`).
+    """
     policy = lambda name: str(out / "policies" / name)  # noqa: E731
+    screening = [str(p.name) for p in chain.screen.policies]
     trials = out / "scenarios" / "screened.trials"
     scenarios = out / "scenarios" / "split"
     env = [part for name, value in _ENV.items() for part in ("--env", f"{name}={value}")]
-    logs = [str(trials / name / "trials.jsonl") for name in SCREENING]
-    donors = [part for name in SCREENING if name != BASE for part in ("--donor", policy(name))]
+    logs = [str(trials / name / "trials.jsonl") for name in screening]
+    donors = [part for name in screening if name != BASE for part in ("--donor", policy(name))]
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         Stage(
@@ -71,8 +75,12 @@ def stages(out: Path) -> list[Stage]:
         ),
         Stage(
             "driven",
-            (("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / "driven")),),
-            out / "driven" / "meta" / "roborecover" / "candidates.json",
+            tuple(
+                ("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / name),
+                 "--seeds", seeds)
+                for name, seeds in DRIVEN.items()
+            ),
+            out / list(DRIVEN)[-1] / "meta" / "roborecover" / "candidates.json",
         ),
         Stage(
             "scenarios",
@@ -103,7 +111,7 @@ def stages(out: Path) -> list[Stage]:
             "monitor data",
             (_cli(
                 "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
-                *(part for name in SCREENING for part in ("--policy", policy(name))),
+                *(part for name in screening for part in ("--policy", policy(name))),
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0",
             ),),
             out / "monitor_data" / "validation_natural",
@@ -139,17 +147,15 @@ def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
     Raises:
         ScenarioError: a command failed, or there is no such stage.
     """
-    todo = stages(out)
-    unknown = set(only) - {s.name for s in todo}
-    if unknown:
-        raise ScenarioError(f"no stage {sorted(unknown)}; there are {[s.name for s in todo]}")
     if not CHAIN.is_file():
         raise ScenarioError(
             f"{CHAIN} is not here: a study is made in a checkout of the repository, whose top folder has the "
             "configurations of its training and of its scenarios"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    (out / CHAIN.name).write_text(CHAIN.read_text().replace(CHAIN_ROOT, str(out)))
+    todo = stages(out, chain_for(out))
+    unknown = set(only) - {s.name for s in todo}
+    if unknown:
+        raise ScenarioError(f"no stage {sorted(unknown)}; there are {[s.name for s in todo]}")
     for number, stage in enumerate(todo, 1):
         where = f"[{number}/{len(todo)}] {stage.name}"
         if only and stage.name not in only:
@@ -168,6 +174,13 @@ def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
         with (out / "stages.jsonl").open("a") as file:
             file.write(json.dumps({"stage": stage.name, "minutes": round(minutes, 1)}) + "\n")
     return None if only else assemble(out)
+
+
+def chain_for(out: Path) -> ChainConfig:
+    """The scenarios' recipe, written anew so that it works below `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / CHAIN.name).write_text(CHAIN.read_text().replace(CHAIN_ROOT, str(out)))
+    return read_config(out / CHAIN.name)
 
 
 def assemble(out: Path) -> StudyDefinition:
@@ -189,7 +202,7 @@ def assemble(out: Path) -> StudyDefinition:
     write_definition(study)
     shutil.rmtree(data, ignore_errors=True)
     os.replace(partial_data, data)
-    return study
+    return read_definition(data)
 
 
 def _cli(*argv: str) -> tuple[str, ...]:
@@ -197,12 +210,10 @@ def _cli(*argv: str) -> tuple[str, ...]:
 
 
 def _run(command: Sequence[str]) -> None:
-    environment = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1", **os.environ, **KERNELS}
-    done = subprocess.run(
-        [sys.executable, "-m", *command], env=environment, preexec_fn=partial(end_with_parent, os.getpid())
-    )
-    if done.returncode:
+    module, *argv = command
+    status = run_module(module, argv, KERNELS)
+    if status:
         raise ScenarioError(
-            f"`python -m {shlex.join(command)}` ended with status {done.returncode}; what it said is above. "
+            f"`python -m {shlex.join(command)}` ended with status {status}; what it said is above. "
             "What had finished is kept: run the same command again"
         )

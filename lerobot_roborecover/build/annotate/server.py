@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 from starlette.applications import Starlette
@@ -29,21 +28,14 @@ from lerobot_roborecover.build.annotate.traces import Place, suggest, traces
 from lerobot_roborecover.build.annotate.votes import Vote, VoteBook, VoteError, parse_vote
 from lerobot_roborecover.build.candidates import CandidateSet
 from lerobot_roborecover.build.web.guard import Refusal, check_token, guarded, read_body, with_cookie
+from lerobot_roborecover.build.web.page import PageFiles
 from lerobot_roborecover.scenario import ScenarioError, Source
 
 MAX_BODIES_PLOTTED = 4
-_PAGE = {
-    "": ("index.html", "text/html"),
-    "app.js": ("app.js", "text/javascript"),
-    "drafts.js": ("drafts.js", "text/javascript"),
-    "frames.js": ("frames.js", "text/javascript"),
-    "plots.js": ("plots.js", "text/javascript"),
-    "outbox.js": ("outbox.js", "text/javascript"),
-    "panel.js": ("panel.js", "text/javascript"),
-    "readout.js": ("readout.js", "text/javascript"),
-    "guide.js": ("guide.js", "text/javascript"),
-    "style.css": ("style.css", "text/css"),
-}
+_PAGE = PageFiles(
+    "lerobot_roborecover.build.annotate", "app.js", "drafts.js", "frames.js", "plots.js", "outbox.js",
+    "panel.js", "readout.js", "guide.js",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -103,11 +95,7 @@ class Handlers:
         self.desk(request)
         if "token" in request.query_params:
             return with_cookie(request, request.path_params["annotator"])
-        found = _PAGE.get(request.path_params.get("file", ""))
-        if found is None:
-            raise Refusal(404, "there is no such file")
-        data = files("lerobot_roborecover.build.annotate").joinpath("page", found[0]).read_bytes()
-        return Response(data, media_type=found[1])
+        return _PAGE.response(request.path_params.get("file", ""))
 
     async def session(self, request: Request) -> Response:
         """Who annotates what, how far they are, and the guide."""

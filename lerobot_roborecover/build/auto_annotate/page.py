@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from typing import Any
 
 from lerobot_roborecover.build.annotate.guide import STAGES, TYPES
@@ -17,7 +16,6 @@ LOOK_EVERY = 10
 """Frames from one look to the next: one press of Shift and the right arrow."""
 WAIT_S = 120.0
 """Longest that a frame or an episode may take."""
-_POLL_S = 0.004
 
 _READ = """() => {
   const readout = document.querySelector("#readout"), rows = {};
@@ -35,6 +33,17 @@ _SHEET = """() => ({
   total: document.querySelector("#total").textContent,
   message: document.querySelector("#message").textContent,
 })"""
+_AT = "([frame]) => Number(document.querySelector('#readout').dataset.step) === frame"
+_SAVED = "() => [undefined, '0'].includes(document.body.dataset.waiting)"
+_OPENED = """([after]) => {
+  const id = document.body.dataset.episode;
+  const shown = document.querySelector("#cameras canvas")?.dataset.episode;
+  return id && id !== after && shown === id && !document.querySelector("#frame").textContent.includes("…");
+}"""
+_AT_END = """() => {
+  const [at, last] = document.querySelector("#frame").textContent.split(" / ").map(Number);
+  return at === last && Number(document.querySelector("#readout").dataset.step) === last;
+}"""
 
 
 class Annotator:
@@ -76,18 +85,14 @@ class Annotator:
 
     def saved(self) -> None:
         """Waits until the server has every vote on disk."""
-        self._wait(lambda s: s["waiting"] in (None, "0"), "the last votes to be saved")
+        self._wait(_SAVED, "the last votes to be saved")
 
     def _opened(self, after: str) -> Sheet:
-        self._wait(
-            lambda s: s["id"] and s["id"] != after and s["shown"] == s["id"] and "…" not in s["frame"],
-            "the next episode",
-        )
+        self._wait(_OPENED, "the next episode", after)
         self._press("End")
-        said = self._wait(
-            lambda s: _numbers(s["frame"])[0] == _numbers(s["frame"])[1] == s["readout"], "its end"
-        )
-        last = _numbers(said["frame"])[1]
+        self._wait(_AT_END, "its end")
+        said = self._page.evaluate(_SHEET)
+        last = int(said["frame"].split(" / ")[1])
         seconds = float(said["time"].split()[0])
         self._press("Home")
         self._at = 0
@@ -150,33 +155,24 @@ class Annotator:
         self._read(frame)
 
     def _read(self, frame: int) -> dict[str, dict[str, float]]:
-        until = time.monotonic() + WAIT_S
-        while True:
+        said = self._page.evaluate(_READ)
+        if said["step"] != frame:
+            self._wait(_AT, f"frame {frame}", frame)
             said = self._page.evaluate(_READ)
-            if said["step"] == frame:
-                return said["rows"]
-            if time.monotonic() > until:
-                raise ScenarioError(
-                    f"the page shows frame {said['step']} where {frame} was asked for: "
-                    f"{self._page.evaluate(_SHEET)['message']!r}"
-                )
-            time.sleep(_POLL_S)
+        return said["rows"]
 
-    def _wait(self, wanted: Any, what: str) -> dict[str, Any]:
-        until = time.monotonic() + WAIT_S
-        while True:
+    def _wait(self, wanted: str, what: str, *values: Any) -> None:
+        """Until a condition on the page holds."""
+        from playwright.sync_api import TimeoutError as WaitedInVain
+
+        try:
+            self._page.wait_for_function(wanted, arg=list(values), timeout=1000 * WAIT_S)
+        except WaitedInVain:
             said = self._page.evaluate(_SHEET)
-            if wanted(said):
-                return said
-            if time.monotonic() > until:
-                raise ScenarioError(f"waited {WAIT_S:g} s for {what}; the page says {said['message']!r}")
-            time.sleep(_POLL_S)
+            raise ScenarioError(
+                f"waited {WAIT_S:g} s for {what}; the page is at frame {said['readout']} of {said['id']!r} "
+                f"and says {said['message']!r}"
+            ) from None
 
     def _press(self, key: str) -> None:
         self._page.keyboard.press(key)
-
-
-def _numbers(frame: str) -> tuple[int, int]:
-    """`12 / 99` as numbers; -1 where there is none yet."""
-    found = re.fullmatch(r"(\d+) / (\d+)", frame)
-    return (int(found[1]), int(found[2])) if found else (-1, -2)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from lerobot_roborecover.build.collect.judge import Verdict
@@ -20,6 +18,7 @@ from lerobot_roborecover.build.collect.rollouts import (
 )
 from lerobot_roborecover.build.collect.server import SERVER
 from lerobot_roborecover.build.collect.write import Writing, write_collection
+from lerobot_roborecover.build.film import Film
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import RunSpec
 from lerobot_roborecover.env.slots import SlotPool
@@ -104,27 +103,17 @@ def _drawing(options: CollectOptions, env: Any, *, films: bool = False) -> Mappi
 
 
 def _load_host(options: CollectOptions, env: Any) -> Any:
-    from lerobot.configs.policies import PreTrainedConfig
-
+    from lerobot_roborecover.build.hosts import policy_config, policy_host
     from lerobot_roborecover.env.intervention_options import POLICY_TYPE
-    from lerobot_roborecover.evaluate.runner import load_host
-    from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
 
-    find_file(options.policy, CONFIG_FILE)
-    overrides = [f"--{o.removeprefix('--')}" for o in options.policy_options]
-    overrides += [f"--device={options.device}"] if options.device else []
-    config = PreTrainedConfig.from_pretrained(options.policy, cli_overrides=overrides)
-    config.pretrained_path = Path(options.policy)
+    config = policy_config(options.policy, options.policy_options, options.device)
     if config.type == POLICY_TYPE:
         raise OptionError(
             f"--policy.path={options.policy}: an intervention goes back in time and cannot be replayed as "
             "one rollout; collect from its base policy"
         )
-    runner = SimpleNamespace(max_batch=options.max_batch)
-    return load_host(
-        SimpleNamespace(
-            policy=config, env=env, rename_map=dict(options.rename_map), seed=options.seed, runner=runner
-        )
+    return policy_host(
+        config, env, rename_map=options.rename_map, seed=options.seed, max_batch=options.max_batch
     )
 
 
@@ -162,7 +151,6 @@ def film_and_write(
         versions = one.receive()
         if not isinstance(versions, dict):
             raise ScenarioError(f"no simulator could be made to film with: {versions.message}")
-        films = {k: v for k, v in slot.options.items() if k not in ("assets_dir", "robotwin_root")}
         writing = Writing(
             records=book.records,
             parts=book.work / PARTS_FOLDER,
@@ -171,8 +159,7 @@ def film_and_write(
             fps=round(pool.spaces()["hz"]),
             versions=versions,
             frames=f"{options.frames}/{options.film_every}",
-            film_every=options.film_every,
-            film_options=films,
+            film=Film(options.film_every, slot.options),
             part_size=options.part_size,
             description=options.description,
             license=options.license,

@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +53,8 @@ class Writing:
     """Of the simulator."""
     frames: str
     """What is filmed; names the parts, so that another size is filmed anew."""
-    film_every: int = 1
-    """Steps from one picture to the next."""
-    film_options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the simulator that films, as far as they do not name folders; kept with every candidate, so that
-    what was seen can be rendered again."""
+    film: Film
+    """Kept with every candidate, so that what was seen can be rendered again."""
     part_size: int = 20
     """Candidates of a part: what is lost, at most, when the writing is stopped."""
     description: str = ""
@@ -189,7 +186,7 @@ def _films(
 
         return FilmJob(
             v.scenario.task, record.reset, record.actions, tuple(poses), np.stack(list(poses.values())),
-            writing.film_every,
+            writing.film.every,
         )  # fmt: skip
 
     crew = writing.pool.slots(min(writing.slots, len(chunk)))
@@ -205,7 +202,7 @@ def _films(
             )
             continue
         record = read_record(record_path(writing.records, v.scenario.id))
-        yield _recording(v, record, film, Film(writing.film_every, writing.film_options))
+        yield _recording(v, record, film, writing.film)
 
 
 def _recording(v: Verdict, record: Record, film: Filmed, filmed: Film) -> Recording:

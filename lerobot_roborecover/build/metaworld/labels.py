@@ -35,6 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_roborecover.scenario import DeviationType, Stage
 from lerobot_roborecover.simulators.metaworld import MetaworldSimulator
+from lerobot_roborecover.simulators.metaworld_marks import FINAL_OFFSET_M
 
 CONTACT_DISTANCE_M, APPROACH_DISTANCE_M = 0.08, 0.12
 PLACE_DISTANCE_M = 0.10
@@ -50,9 +51,6 @@ OTHER_MOVED_M = 0.01
 OTHER_TOUCHED_M = 0.06
 LOST_M = 0.05
 
-_FINAL_OFFSET_M = {"assembly-v3": (0.13, 0.0, 0.0), "hammer-v3": (-0.16, -0.09, 0.0)}
-"""Where the handled point is relative to the observation's goal once the task is done, for the tasks of the
-shipped set (`simulators/metaworld_marks.py` has more); zero elsewhere."""
 _OTHER_PARTS = ("nail_link", "cmbutton")
 
 
@@ -82,7 +80,7 @@ class Trace:
 
     def remaining_m(self) -> np.ndarray:
         """(T,) distance of the object from where it has to go."""
-        goal = np.array(self.raw)[:, 36:39] + _FINAL_OFFSET_M.get(self.task_name, (0.0, 0.0, 0.0))
+        goal = np.array(self.raw)[:, 36:39] + FINAL_OFFSET_M.get(self.task_name, (0.0, 0.0, 0.0))
         return np.linalg.norm(self.object_m() - goal, axis=1)
 
 

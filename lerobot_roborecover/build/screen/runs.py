@@ -299,8 +299,8 @@ def forget_trials(folder: Path, outcomes: Sequence[str]) -> int:
     if not path.exists():
         return 0
     TrialLog(path).close()  # nobody else has it open, and a line that a crash cut off is gone
-    kept = [r for r in read_trial_log(path) if r.outcome not in outcomes]
-    gone = [r for r in read_trial_log(path) if r.outcome in outcomes]
+    rows = read_trial_log(path)
+    kept, gone = ([r for r in rows if (r.outcome in outcomes) is out] for out in (False, True))
     if gone:
         with open(folder / RETRIED_FILE, "a", encoding="utf-8") as file:
             file.writelines(json.dumps(asdict(r)) + "\n" for r in gone)

@@ -10,7 +10,6 @@ import asyncio
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 from starlette.applications import Starlette
@@ -23,17 +22,12 @@ from lerobot_roborecover.build.teleop.hub import Hub, Viewer
 from lerobot_roborecover.build.teleop.pilot import Command, Pilot
 from lerobot_roborecover.build.teleop.protocol import VERSION, held_axes, parse
 from lerobot_roborecover.build.web.guard import Refusal, check_token, guarded, with_cookie
+from lerobot_roborecover.build.web.page import PageFiles
 from lerobot_roborecover.scenario import ScenarioError
 
 NAME = "drive"
 """Of the address and of the cookie."""
-_PAGE = {
-    "": ("index.html", "text/html"),
-    "app.js": ("app.js", "text/javascript"),
-    "inputs.js": ("inputs.js", "text/javascript"),
-    "link.js": ("link.js", "text/javascript"),
-    "style.css": ("style.css", "text/css"),
-}
+_PAGE = PageFiles("lerobot_roborecover.build.teleop", "app.js", "inputs.js", "link.js")
 
 
 @dataclass(frozen=True)
@@ -53,11 +47,7 @@ def make_app(cockpit: Cockpit) -> Any:
         check_token(request, NAME, cockpit.token, "roborecover teleop")
         if "token" in request.query_params:
             return with_cookie(request, NAME)
-        found = _PAGE.get(request.path_params.get("file", ""))
-        if found is None:
-            raise Refusal(404, "there is no such file")
-        data = files("lerobot_roborecover.build.teleop").joinpath("page", found[0]).read_bytes()
-        return Response(data, media_type=found[1])
+        return _PAGE.response(request.path_params.get("file", ""))
 
     async def refuse(_request: Request, err: Exception) -> Response:
         assert isinstance(err, Refusal)
