@@ -1,4 +1,4 @@
-"""The composite policy: the same under LeRobot's loop and the fast runner, slot by slot, and as users type it."""
+"""The composite policy: as LeRobot's loop and the fast runner run it, slot by slot, and as users type it."""
 
 from __future__ import annotations
 
