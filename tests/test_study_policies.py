@@ -13,8 +13,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SHIPPED = Path(str(files("lerobot_roborecover"))) / "data" / "metaworld_study" / "policies"
 NAMES = ("act", "act_clean", "act_few", "diffusion", "diffusion_few", "tdmpc")
-IN_THE_PACKAGE = tuple(name for name in NAMES if name != "diffusion")
-"""The training of `diffusion` was cut short."""
 
 pytestmark = [pytest.mark.metaworld, pytest.mark.lerobot]
 
@@ -157,8 +155,8 @@ def test_the_table_adds_up():
 
 
 def test_the_shipped_policies_are_small_and_say_what_they_need():
-    assert sorted(path.name for path in SHIPPED.iterdir()) == list(IN_THE_PACKAGE)
-    for name in IN_THE_PACKAGE:
+    assert sorted(path.name for path in SHIPPED.iterdir()) == list(NAMES)
+    for name in NAMES:
         folder = SHIPPED / name
         assert (folder / "model.safetensors").stat().st_size <= 2.5 * 2**20, name
         assert not (folder / "train_config.json").exists(), "it names the machine it was trained on"
@@ -168,7 +166,7 @@ def test_the_shipped_policies_are_small_and_say_what_they_need():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", IN_THE_PACKAGE)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_policy_solves_starts(name):
     """Two of three easy starts: another processor may round a trial the other way."""
     from lerobot_roborecover.build.metaworld.initial_success import evaluate
