@@ -112,6 +112,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
             (_cli(
                 "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
                 *(part for name in screening for part in ("--policy", policy(name))),
+                "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0",
             ),),
             out / "monitor_data" / "validation_natural",
