@@ -123,6 +123,26 @@ def test_a_missing_trial_is_an_error():
 
 
 @settings(max_examples=30, deadline=None)
+@given(same=st.fixed_dictionaries({name: st.sampled_from([0, 5]) for name in "abc"}), noisy=st.integers(0, 5))
+def test_one_trial_of_a_deterministic_policy_stands_for_all(same, noisy):
+    scenario = fake_scenario(0)
+    rows = rows_with(scenario, {**same, "d": noisy})
+    (whole,) = screen([scenario], rows, ScreenRule())
+    first = {name: [r for r in given if name == "d" or r.trial == 0] for name, given in rows.items()}
+    (found,) = screen([scenario], first, ScreenRule(), deterministic="abc")
+    kept = (found.successes, found.trials, found.decision.verdict, found.decision.reason)
+    assert kept == (whole.successes, whole.trials, whole.decision.verdict, whole.decision.reason)
+    assert found.counts["a"].trials == 1
+
+
+def test_a_policy_that_is_not_deterministic_is_found_out_where_it_has_more_trials():
+    scenario = fake_scenario(0)
+    rows = rows_with(scenario, {**dict.fromkeys(NAMES, 5), "c": 3})
+    with pytest.raises(ScenarioError, match="c is said to be deterministic, but trials 0 and 3 of"):
+        screen([scenario], rows, ScreenRule(), deterministic=["c"])
+
+
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_order_does_not_matter(data):
     scenarios = [replace(fake_scenario(0), id=f"s{i}") for i in range(4)]

@@ -28,6 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "0.9: 2 to 18 of 20)",
     )  # fmt: skip
     add(
+        "--deterministic", action="append", default=[], metavar="NAME",
+        help="this policy does the same in every trial: run one of each scenario, and count it as all; may "
+        "be given again",
+    )  # fmt: skip
+    add(
         "--max-invalid", type=int, default=0, metavar="N",
         help="invalid trials that a scenario may have; they count as failures (%(default)s)",
     )  # fmt: skip
@@ -75,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         out=args.out,
         trials_folder=args.trials_folder,
         rule=rule,
+        deterministic=args.deterministic,
         run_seed=args.run_seed,
         env=env,
         trials_from=args.trials_from,

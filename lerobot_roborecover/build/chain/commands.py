@@ -112,6 +112,7 @@ def screen_command(config: ChainConfig, places: Places) -> list[str]:
 def _of_policy(policy: PolicyPart) -> list[str]:
     argv = [w for k, v in policy.options.items() for w in ("--policy-option", f"{policy.name}:{k}={text(v)}")]
     argv += [w for k, v in policy.env.items() for w in ("--env", f"{policy.name}:{k}={text(v)}")]
+    argv += ["--deterministic", str(policy.name)] if policy.deterministic else []
     if policy.rename_map:
         argv += ["--rename-map", f"{policy.name}:{json.dumps(policy.rename_map)}"]
     return argv

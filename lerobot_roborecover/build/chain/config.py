@@ -75,6 +75,8 @@ class PolicyPart:
 
     path: str = ""
     name: str | None = None
+    deterministic: bool = False
+    """It does the same in every trial: one is run of each scenario, and counts as all."""
     options: dict[str, Any] = field(default_factory=dict)
     env: dict[str, Any] = field(default_factory=dict)
     rename_map: dict[str, str] = field(default_factory=dict)
@@ -229,7 +231,8 @@ def _check(config: ChainConfig) -> None:
     for number, policy in enumerate(config.screen.policies):
         if not policy.path:
             raise OptionError(f"screen.policies.{number}.path is missing: a folder or Hub id")
-        if (policy.options or policy.env or policy.rename_map) and not policy.name:
+        own = (policy.options, policy.env, policy.rename_map, policy.deterministic)
+        if any(own) and not policy.name:
             raise OptionError(f"screen.policies.{number}: options of its own need a name")
     if config.screen.keep is not None and len(config.screen.keep) != 2:
         raise OptionError(f"screen.keep {config.screen.keep}: two numbers, fewest and most")

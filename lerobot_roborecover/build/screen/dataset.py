@@ -41,6 +41,8 @@ class ScreenRequest:
     trials_folder: Path | None = None
     """Where trials are kept between runs; None takes `OUT.trials`."""
     rule: ScreenRule = field(default_factory=ScreenRule)
+    deterministic: Sequence[str] = ()
+    """Names of policies that do the same in every trial: one is run of each scenario, and counts as all."""
     run_seed: int = 1000
     env: Sequence[str] = ()
     """`name=value` options of the recovery env type, for all policies."""
@@ -85,6 +87,12 @@ def screen_dataset(
         SimulatorError, TrialLogError: what `roborecover eval` refuses.
     """
     check_policies(request.policies)
+    unknown = set(request.deterministic) - {p.name for p in request.policies}
+    if unknown:
+        raise OptionError(
+            f"--deterministic {' '.join(sorted(unknown))}: not among the policies "
+            f"{', '.join(p.name for p in request.policies)}"
+        )
     for option in (*request.env, *(o for p in request.policies for o in p.env)):
         if option.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
             raise OptionError(
@@ -103,8 +111,9 @@ def screen_dataset(
                 take_trials(other / policy.name, folder)
         if request.retry:
             forget_trials(folder, request.retry)
+        count = 1 if policy.name in request.deterministic else request.rule.trials
         trials = run_policy(
-            policy, request.dataset, scenarios.platform, request.trials, trials=request.rule.trials,
+            policy, request.dataset, scenarios.platform, request.trials, trials=count,
             run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
             slots=request.slots, max_batch=request.max_batch,
             on_row=lambda row, done, total, name=policy.name: progress(name, done, total),
@@ -112,7 +121,7 @@ def screen_dataset(
         rows[policy.name] = [t.row for t in trials]
     if request.shard:
         return Screening([], rows)
-    found = screen(scenarios, rows, request.rule)
+    found = screen(scenarios, rows, request.rule, request.deterministic)
     source = Path(request.dataset).expanduser()
     write_stage(
         request.out,
@@ -136,6 +145,7 @@ def _record(
     low, high = request.rule.check(len(request.policies))
     return {
         "rule": {**asdict(request.rule), "successes": [low, high]},
+        "deterministic": sorted(request.deterministic),
         "run_seed": request.run_seed,
         "env": list(request.env),
         "policies": [

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from typing import Any
@@ -94,6 +94,8 @@ class PolicyCount:
     trials: int
     invalid: Mapping[str, int]
     """Trials by invalid outcome."""
+    each_counts: int = 1
+    """As how many of the rule's trials a trial counts: all of them, where the policy is deterministic."""
 
 
 @dataclass(frozen=True)
@@ -108,21 +110,24 @@ class Screened:
     @property
     def successes(self) -> int:
         """Of all policies."""
-        return sum(c.successes for c in self.counts.values())
+        return sum(c.successes * c.each_counts for c in self.counts.values())
 
     @property
     def trials(self) -> int:
         """Of all policies."""
-        return sum(c.trials for c in self.counts.values())
+        return sum(c.trials * c.each_counts for c in self.counts.values())
 
     @property
     def invalid(self) -> Counter[str]:
         """Invalid trials of all policies, by outcome."""
-        return sum((Counter(c.invalid) for c in self.counts.values()), Counter())
+        return _all_invalid(self.counts)
 
 
 def screen(
-    scenarios: Sequence[Scenario], rows: Mapping[str, Sequence[TrialRow]], rule: ScreenRule
+    scenarios: Sequence[Scenario],
+    rows: Mapping[str, Sequence[TrialRow]],
+    rule: ScreenRule,
+    deterministic: Collection[str] = (),
 ) -> list[Screened]:
     """Judges every scenario.
 
@@ -131,12 +136,13 @@ def screen(
         rows: trials by the policy's name; those of other scenarios, from other starts, or beyond the rule's
             number of trials are left out. Their order does not matter.
         rule: who stays.
+        deterministic: names of policies that do the same in every trial: one of each scenario counts as all.
 
     Returns:
         One result a scenario, in their order.
 
     Raises:
-        ScenarioError: a scenario lacks a trial of a policy.
+        ScenarioError: a scenario lacks a trial of a policy, or two trials of a deterministic one differ.
     """
     low, high = rule.check(len(rows))
     of: dict[tuple[str, str, str], dict[int, TrialRow]] = defaultdict(dict)
@@ -149,17 +155,33 @@ def screen(
         counts = {}
         for name in sorted(rows):
             mine = of[name, scenario.id, scenario.sha256()]
-            if len(mine) < rule.trials:
+            needed = 1 if name in deterministic else rule.trials
+            if len(mine) < needed:
                 raise ScenarioError(
-                    f"scenario {scenario.id} has {len(mine)} of {rule.trials} trials by {name}; run the "
+                    f"scenario {scenario.id} has {len(mine)} of {needed} trials by {name}; run the "
                     "command again to finish them"
                 )
-            counts[name] = _count(list(mine.values()))
+            found = [mine[trial] for trial in sorted(mine)]
+            if name in deterministic:
+                found = [_the_one(name, found)]
+            counts[name] = _count(found, rule.trials // needed if name in deterministic else 1)
         result.append(Screened(scenario, counts, _decide(scenario.id, counts, rule, low, high)))
     return result
 
 
-def _count(rows: Sequence[TrialRow]) -> PolicyCount:
+def _the_one(name: str, rows: Sequence[TrialRow]) -> TrialRow:
+    """The trial that stands for all."""
+    for row in rows[1:]:
+        if (row.outcome, row.actions_sha256) != (rows[0].outcome, rows[0].actions_sha256):
+            raise ScenarioError(
+                f"{name} is said to be deterministic, but trials {rows[0].trial} and {row.trial} of "
+                f"{row.scenario_id} differ ({rows[0].outcome} after {rows[0].steps} steps, {row.outcome} "
+                f"after {row.steps}); leave out --deterministic {name}"
+            )
+    return rows[0]
+
+
+def _count(rows: Sequence[TrialRow], each_counts: int) -> PolicyCount:
     invalid = Counter(r.outcome for r in rows if not Outcome(r.outcome).valid)
     policies = sorted({r.policy for r in rows})
     return PolicyCount(
@@ -167,15 +189,20 @@ def _count(rows: Sequence[TrialRow]) -> PolicyCount:
         sum(r.success for r in rows),
         len(rows),
         dict(sorted(invalid.items())),
+        each_counts,
     )
 
 
 def _decide(
     scenario_id: str, counts: Mapping[str, PolicyCount], rule: ScreenRule, low: int, high: int
 ) -> Decision:
-    invalid = sum((Counter(c.invalid) for c in counts.values()), Counter())
-    won, total = sum(c.successes for c in counts.values()), sum(c.trials for c in counts.values())
-    each = ", ".join(f"{name} {c.successes}/{c.trials}" for name, c in counts.items())
+    invalid = _all_invalid(counts)
+    won = sum(c.successes * c.each_counts for c in counts.values())
+    total = sum(c.trials * c.each_counts for c in counts.values())
+    each = ", ".join(
+        f"{name} {c.successes}/{c.trials}{f' (x {c.each_counts})' if c.each_counts > 1 else ''}"
+        for name, c in counts.items()
+    )
     detail = f"{won} of {total} successes ({each}); {low} to {high} stay"
     if invalid:
         detail += "; invalid: " + ", ".join(f"{n} {outcome}" for outcome, n in sorted(invalid.items()))
@@ -188,6 +215,15 @@ def _decide(
         reason = "too hard"
     by = f"{total} trials of {len(counts)} policies"
     return Decision(scenario_id, "screen", "dropped" if reason else "kept", reason, detail, by)
+
+
+def _all_invalid(counts: Mapping[str, PolicyCount]) -> Counter[str]:
+    return Counter(
+        {
+            outcome: sum(c.invalid.get(outcome, 0) * c.each_counts for c in counts.values())
+            for outcome in sorted({outcome for c in counts.values() for outcome in c.invalid})
+        }
+    )
 
 
 def provenance_of(found: Screened, rule: ScreenRule, run_seed: int) -> dict[str, Any]:
