@@ -19,9 +19,12 @@ def policy_config(policy: str, options: Sequence[str] = (), device: str | None =
     Raises:
         OptionError: there is no such checkpoint.
     """
+    import lerobot.policies  # noqa: F401 - registers LeRobot's policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    from lerobot_roborecover.interventions import configuration_intervention  # noqa: F401 - and ours
     from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
+    from lerobot_roborecover.remote import configuration_remote  # noqa: F401
 
     find_file(policy, CONFIG_FILE)
     overrides = [f"--{o.removeprefix('--')}" for o in options]
