@@ -22,7 +22,7 @@ from lerobot_roborecover.study.definition import StudyDefinition, read_definitio
 
 POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 5, "diffusion_few": 5, "tdmpc": 1}
 """Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
-DRIVEN = {"driven1": "500-501", "driven2": "502-503", "driven3": "504-505"}
+DRIVEN = {"driven1": "500-501", "driven2": "502-503"}
 """Seeds of the scripted operator's recordings, by the chain's name for them."""
 BASE = "act"
 CHAIN, CHAIN_ROOT = Path("policies/build/metaworld_study.yaml"), "outputs/study"
