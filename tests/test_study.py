@@ -64,7 +64,9 @@ def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
     out = tmp_path / "out"
     command = ["study", "--data", str(study), "--out", str(out), "--slots", "1"]
     assert main([*command, "--no-report"]) == 0
-    assert "[2/2] act/initial: 8 trials" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "[2/2] act/" in said
+    assert "act/initial: 8 trials" in said
     outcomes = read_outcomes(out / "outcomes.csv")
     assert len(outcomes) == COUNT * (2 + 2)
 
@@ -131,6 +133,7 @@ def test_refusals(study, tmp_path, capsys):
 
     assert "has no study.json" in refused("--data", str(tmp_path))
     assert "--every=0: a count from 1" in refused("--data", str(study), "--every", "0")
+    assert "--jobs=-1: a count" in refused("--data", str(study), "--jobs", "-1")
     assert "add --make" in refused("--stage", "policies")
     (study / "outcomes.csv").write_text("arm,scenario_id,trial,outcome,steps\na,b,c,d,e\n")
     with pytest.raises(ScenarioError, match="line 2"):

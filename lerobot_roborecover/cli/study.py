@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--data", type=Path, help="folder of the study (default: the one that ships with the package)")
     add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
     add("--every", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
-    add("--slots", type=int, default=0, help="simulators at once (0: one per core)")
+    add("--jobs", type=int, default=0, help="runs of policies at once (0: one per core)")
+    add("--slots", type=int, default=0, help="simulators at once in each (0: the cores left for it)")
     add(
         "--make", action="store_true",
         help="make the study first, from nothing but the packages: train, build, fine-tune (hours)",
@@ -44,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.every < 1:
         raise OptionError(f"--every={args.every}: a count from 1")
+    for name in ("jobs", "slots"):
+        if getattr(args, name) < 0:
+            raise OptionError(f"--{name}={getattr(args, name)}: a count; 0 follows the cores")
     if args.stage and not args.make:
         raise OptionError("--stage names a stage of --make; add --make")
     if args.make:
@@ -62,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
         for argv in [*(a.argv for a in todo), report_command(study, todo, args.out)]:
             print(shlex.join(["roborecover", *argv]))
         return 0
-    done = evaluate(study, args.out, args.every, args.slots, say=lambda line: print(line, flush=True))
+    done = evaluate(
+        study, args.out, args.every, args.slots, args.jobs, say=lambda line: print(line, flush=True)
+    )
     write_outcomes(args.out / "outcomes.csv", outcomes_of(done))
     compared = compare_with_stored(study, done)
     if not args.no_report:

@@ -6,9 +6,11 @@ import json
 import shlex
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.evaluate.sizes import usable_cores
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.commands import Arm, arms, report_command
@@ -33,7 +35,12 @@ def scenario_ids(study: StudyDefinition, every: int) -> list[str]:
 
 
 def evaluate(
-    study: StudyDefinition, out: Path, every: int = 1, slots: int = 0, say: Callable[[str], None] = print
+    study: StudyDefinition,
+    out: Path,
+    every: int = 1,
+    slots: int = 0,
+    jobs: int = 0,
+    say: Callable[[str], None] = print,
 ) -> list[Arm]:
     """Runs every arm that is not finished.
 
@@ -41,25 +48,38 @@ def evaluate(
         study: what.
         out: folder of the results; a rerun goes on there.
         every: take every n-th scenario.
-        slots: simulators at once; 0: one per core.
+        slots: simulators at once in each arm; 0: as many as there are cores for it.
+        jobs: arms at once; 0: one per core. A small policy keeps one core busy, and no second.
         say: takes progress lines.
 
     Returns:
         The arms, all finished.
 
     Raises:
-        ScenarioError: an arm failed; the message has the end of its output.
+        ScenarioError: an arm failed; the message has the end of its output. Arms under way end first.
     """
     ids = scenario_ids(study, every)
-    todo = list(arms(study, out, ids if every > 1 else (), slots))
-    for number, arm in enumerate(todo, 1):
+    cores = usable_cores()
+    jobs = jobs or cores
+    todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
+
+    def run(arm: Arm) -> float:
         began, done = time.monotonic(), arm.out / DONE_FILE
-        same = json.dumps([*arm.argv, ids])
+        # With other slots the trials are the same: what has finished is not run again for them.
+        same = json.dumps([[a for a in arm.argv if not a.startswith("--runner.slots=")], ids])
         if not (done.exists() and done.read_text() == same):
             run_command(arm.argv, arm.out / "output.log", study)
             done.write_text(same)
-        rows = len(ids) * arm.trials
-        say(f"[{number}/{len(todo)}] {arm.label}: {rows} trials, {time.monotonic() - began:.0f} s")
+        return time.monotonic() - began
+
+    with ThreadPoolExecutor(jobs) as pool:
+        running = {pool.submit(run, arm): arm for arm in todo}
+        try:
+            for number, finished in enumerate(as_completed(running), 1):
+                arm, seconds = running[finished], finished.result()
+                say(f"[{number}/{len(todo)}] {arm.label}: {len(ids) * arm.trials} trials, {seconds:.0f} s")
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
     return todo
 
 
