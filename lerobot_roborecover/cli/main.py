@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from types import ModuleType
@@ -76,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 done but something is wrong, 2 refused, 130 interrupted.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
+    os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a film
     command = argv[0] if argv else ""
     module = _module(command) if command in COMMANDS else None
     try:
