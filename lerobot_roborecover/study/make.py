@@ -36,6 +36,8 @@ KERNELS: Mapping[str, str] = {
 }
 """torch's kernels chosen alike on every x86-64 processor, so that policies round alike."""
 _ENV = {"obs_type": "state"}
+_TRAIN = "lerobot_roborecover.build.metaworld.frames_in_memory"
+"""`lerobot-train`, fed from memory: the same weights, sooner."""
 _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
 
 
@@ -99,8 +101,8 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
         Stage(
             "correction",
             (
-                ("lerobot.scripts.lerobot_train", "--config_path=policies/train/correction_act.yaml",
-                 f"--policy.path={policy(BASE)}", f"--dataset.root={out / 'donors'}",
+                (_TRAIN, "--config_path=policies/train/correction_act.yaml", f"--policy.path={policy(BASE)}",
+                 "--dataset.repo_id=local/donors", f"--dataset.root={out / 'donors'}",
                  f"--output_dir={correction}"),
                 _cli("export-ema", str(correction / _CHECKPOINT.parent), "--out", str(out / "correction")),
             ),
