@@ -11,7 +11,7 @@ from lerobot_roborecover.build.annotate.serve import AnnotateConfig
 from lerobot_roborecover.build.annotate.votes import ballot, read_votes, votes_folder
 from lerobot_roborecover.build.auto_annotate.annotators import EYES, label_kind
 from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
-from lerobot_roborecover.build.auto_annotate.page import LOOK_EVERY
+from lerobot_roborecover.build.auto_annotate.page import look_every
 from lerobot_roborecover.build.auto_annotate.rules import Verdict, judge
 from lerobot_roborecover.build.auto_annotate.run import annotate
 from lerobot_roborecover.build.candidates import read_candidates
@@ -38,12 +38,28 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
     first = next(iter(whole.values()))
     speed = (np.abs(np.gradient(first["reach"])) + np.abs(np.gradient(first["moved"]))) * FPS
     look = Look(Sheet("it", "do it", LAST, FPS, solved, human))
-    for f in sorted({*range(EYES[eye].first_frame, LAST + 1, LOOK_EVERY), LAST}):
+    for f in sorted({*range(EYES[eye].first_frame, LAST + 1, look_every(FPS)), LAST}):
         look.readings[f] = {
             "hand": {"speed": float(speed[f]), "a3": float(closed[f])},
             **{n: {k: float(v[f]) for k, v in values.items()} for n, values in whole.items()},
         }
     return look
+
+
+@pytest.mark.parametrize("fps", [10, 20, 80, 400])
+def test_looks_follow_the_clock_and_not_the_frames(fps):
+    assert look_every(fps) / fps == pytest.approx(0.125, abs=0.5 / fps + 1e-9)
+    assert look_every(1) == 1
+
+
+def test_where_no_goal_is_shown_the_object_is_the_one_that_ends_farthest_from_its_place():
+    still = {"reach": ramp((0, 0.3), (50, 0.25))}
+    pushed = {"reach": ramp((0, 0.4), (50, 0.02), (100, 0.3)), "moved": ramp((50, 0.0), (60, 0.06))}
+    found = judge(seen("auto-1", first=still, second=pushed), EYES["auto-1"])
+    assert (found.deviation, found.step is not None and 60 <= found.step <= 90) == (
+        DeviationType.SCENE_CHANGE,
+        True,
+    )
 
 
 def carried(stop: int, goal_left: float, reach=None, height=None) -> dict:

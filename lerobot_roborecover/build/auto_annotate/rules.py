@@ -14,8 +14,8 @@ from lerobot_roborecover.build.auto_annotate.annotators import Eye
 from lerobot_roborecover.build.auto_annotate.looking import HAND, Look
 from lerobot_roborecover.scenario import DeviationType, Stage
 
-FALLEN_M = 0.15
-"""An object this far below where it began is off the table."""
+FALLEN_M = 0.3
+"""An object this far below where it began is off the table, not only off what stands on it."""
 THROWN_M = 0.8
 """An object this far from where it began is out of the workspace."""
 OTHER_MOVED_M, OTHER_REACHED_M = 0.01, 0.06
@@ -75,7 +75,8 @@ class _Seen:
         self._reach = {name: _need(look.values(name, "reach")) for name in names}
         self._moved = {name: _need(look.values(name, "moved")) for name in names}
         self._height = {name: _need(look.values(name, "height")) for name in names}
-        self.main, self.others = names[0], names[1:]
+        self.main = self._handled(look, names)
+        self.others = [name for name in names if name != self.main]
         goal = look.values(self.main, "goal")
         self.goal = np.full(self.n, np.inf) if goal is None else goal
         self._has_goal = goal is not None
@@ -84,6 +85,12 @@ class _Seen:
         self.held, self.carried = self._grasps()
         self._released = self._releases()
         self.labels = [self._label(i) for i in range(self.n)]
+
+    def _handled(self, look: Look, names: list[str]) -> str:
+        """The object with a goal; where none has one, the one that ends farthest from where it began."""
+        if look.values(names[0], "goal") is not None:
+            return names[0]
+        return max(names, key=lambda name: self._moved[name][-1])
 
     def fallen(self) -> bool:
         """The object fell off the table."""
