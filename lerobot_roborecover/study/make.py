@@ -198,6 +198,8 @@ def assemble(out: Path) -> StudyDefinition:
     shutil.copytree(out / "scenarios" / "split" / kept, partial_data / "scenarios" / kept, ignore=ignore)
     shutil.copytree(out / "correction", partial_data / "correction", ignore=ignore)
     shutil.copytree(out / "monitor_training" / _CHECKPOINT, partial_data / "monitor", ignore=ignore)
+    for path in (*partial_data.glob("*/config.json"), *partial_data.glob("policies/*/config.json")):
+        _forget_place(path)
     study = StudyDefinition(
         root=partial_data, platform="metaworld", policies=POLICIES, base=BASE, env=_ENV,
         interventions=INTERVENTIONS, environment=KERNELS,
@@ -206,6 +208,13 @@ def assemble(out: Path) -> StudyDefinition:
     shutil.rmtree(data, ignore_errors=True)
     os.replace(partial_data, data)
     return read_definition(data)
+
+
+def _forget_place(path: Path) -> None:
+    """A checkpoint's config without the folder of this machine that its training began from."""
+    config = json.loads(path.read_text())
+    if config.get("pretrained_path"):
+        path.write_text(json.dumps({**config, "pretrained_path": None}, indent=4))
 
 
 def _cli(*argv: str) -> tuple[str, ...]:
