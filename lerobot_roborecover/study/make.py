@@ -121,7 +121,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
         ),
         Stage(
             "monitor",
-            (("lerobot.scripts.lerobot_train", "--config_path=policies/train/monitor_small.yaml",
+            ((_TRAIN, "--config_path=policies/train/monitor_small.yaml",
               f"--dataset.root={out / 'monitor_data' / 'train'}", f"--output_dir={monitor}"),),
             monitor / _CHECKPOINT,
             (monitor,),
