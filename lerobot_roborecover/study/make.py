@@ -20,7 +20,7 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
 
-POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 3, "diffusion_few": 3, "tdmpc": 1}
+POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 2, "diffusion_few": 2, "tdmpc": 1}
 """Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
 DRIVEN = {"driven1": "500-501", "driven2": "502-503"}
 """Seeds of the scripted operator's recordings, by the chain's name for them."""
