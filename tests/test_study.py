@@ -14,7 +14,7 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.commands import arms
 from lerobot_roborecover.study.definition import read_definition
-from lerobot_roborecover.study.make import chain_for, stages
+from lerobot_roborecover.study.make import POLICIES, chain_for, stages
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
 
 COUNT = 4
@@ -152,7 +152,8 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path,
 def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
     found = stages(tmp_path, chain_for(tmp_path))
     assert [s.name for s in found] == [
-        "policies", "driven", "scenarios", "donors", "correction", "monitor data", "monitor",
+        "policies", "driven1", "driven2", "scenarios", "donors", "correction", "monitor data", "monitor",
         "monitor metrics",
     ]  # fmt: skip
-    assert len({s.done for s in found}) == len(found)
+    assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
+    assert {path.name for path in found[0].done} == set(POLICIES), "none of them is forgotten"

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from lerobot_roborecover.build.chain.config import ChainConfig, read_config
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
@@ -38,6 +40,7 @@ KERNELS: Mapping[str, str] = {
 _ENV = {"obs_type": "state"}
 _TRAIN = "lerobot_roborecover.build.metaworld.frames_in_memory"
 """`lerobot-train`, fed from memory: the same weights, sooner."""
+_MONITOR = Path("policies/train/monitor_small.yaml")
 _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
 
 
@@ -48,8 +51,8 @@ class Stage:
     name: str
     commands: tuple[tuple[str, ...], ...]
     """Program and arguments, after `python -m`."""
-    done: Path
-    """Exists once the stage is finished."""
+    done: tuple[Path, ...]
+    """All of them exist once the stage is finished."""
     partial: tuple[Path, ...] = ()
     """Results of an interrupted run that the commands would refuse to write over."""
 
@@ -73,21 +76,22 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
         Stage(
             "policies",
             (("lerobot_roborecover.build.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
-            out / "policies" / "diffusion_few",
+            tuple(out / "policies" / name for name in POLICIES),
         ),
-        Stage(
-            "driven",
-            tuple(
-                ("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / name),
-                 "--seeds", seeds)
-                for name, seeds in DRIVEN.items()
-            ),
-            out / list(DRIVEN)[-1] / "meta" / "roborecover" / "candidates.json",
+        *(
+            Stage(
+                name,
+                (("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / name),
+                  "--seeds", seeds),),
+                (out / name / "meta" / "roborecover" / "candidates.json",),
+                (out / name, out / f"{name}.recordings"),
+            )
+            for name, seeds in DRIVEN.items()
         ),
         Stage(
             "scenarios",
             (_cli("build", str(out / CHAIN.name)),),
-            scenarios,
+            (scenarios,),
         ),
         Stage(
             "donors",
@@ -95,7 +99,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
                 "donors", *logs, "--scenarios", str(scenarios), "--base", policy(BASE), *donors, *env,
                 "--out", str(out / "donors"), "--license", "Apache-2.0",
             ),),
-            out / "donors" / "meta" / "roborecover" / "donors.json",
+            (out / "donors" / "meta" / "roborecover" / "donors.json",),
             (out / "donors",),
         ),
         Stage(
@@ -106,7 +110,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
                  f"--output_dir={correction}"),
                 _cli("export-ema", str(correction / _CHECKPOINT.parent), "--out", str(out / "correction")),
             ),
-            out / "correction",
+            (out / "correction",),
             (correction,),
         ),
         Stage(
@@ -117,13 +121,13 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
                 "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0",
             ),),
-            out / "monitor_data" / "validation_natural",
+            (out / "monitor_data" / "validation_natural",),
         ),
         Stage(
             "monitor",
-            ((_TRAIN, "--config_path=policies/train/monitor_small.yaml",
+            ((_TRAIN, f"--config_path={_MONITOR}",
               f"--dataset.root={out / 'monitor_data' / 'train'}", f"--output_dir={monitor}"),),
-            monitor / _CHECKPOINT,
+            (monitor / "checkpoints" / _last_step(_MONITOR),),
             (monitor,),
         ),
         Stage(
@@ -134,9 +138,14 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
                 "--data", str(out / "monitor_data" / "validation_natural"),
                 "--out", str(out / "monitor_report"),
             ),),
-            out / "monitor_report" / "metrics.json",
+            (out / "monitor_report" / "metrics.json",),
         ),
     ]  # fmt: skip
+
+
+def _last_step(config: Path) -> str:
+    """LeRobot's name for the last checkpoint of a training: earlier ones are of a run that was cut short."""
+    return f"{yaml.safe_load(config.read_text())['steps']:06d}"
 
 
 def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print) -> StudyDefinition | None:
@@ -163,7 +172,7 @@ def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
         where = f"[{number}/{len(todo)}] {stage.name}"
         if only and stage.name not in only:
             continue
-        if stage.done.exists():
+        if all(path.exists() for path in stage.done):
             say(f"{where}: there already")
             continue
         for left in stage.partial:
