@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from lerobot_roborecover.cli.main import main
@@ -13,23 +11,6 @@ from lerobot_roborecover.study.outcomes import read_outcomes
 
 EVERY = 32
 """Two of the test scenarios: policies from both starts, and all interventions."""
-
-
-RECORDED_ON = {"vendor_id": "GenuineIntel", "model": "167"}
-"""Processor that the outcomes are from. Torch's kernels are chosen alike everywhere (`study.json`,
-environment), but nobody has tried another processor yet."""
-ALIKE = 0.8
-"""Share of trials whose outcome has to be the same there, should a last bit differ after all."""
-
-
-def processor() -> dict[str, str]:
-    """Vendor and model, as far as Linux tells."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return {}
-    found = dict(reversed([[part.strip() for part in line.split(":", 1)] for line in lines if ":" in line]))
-    return {key: found.get(key, "") for key in RECORDED_ON}
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +35,5 @@ def test_a_slice_comes_out_as_stored(study, tmp_path, capsys):
     said = capsys.readouterr().out
     trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
     total = trials * len(scenario_ids(study, EVERY))
-    stored, today = read_outcomes(study.outcomes), read_outcomes(tmp_path / "outcomes.csv")
-    assert len(today) == total
-    if processor() != RECORDED_ON and status == 1:
-        same = sum(stored[key][0] == outcome for key, (outcome, _) in today.items())
-        assert same >= ALIKE * total, said
-        return
     assert status == 0, said
     assert f"{total} of {total} trials came out as stored, to the step" in said
