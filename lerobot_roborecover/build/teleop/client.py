@@ -10,7 +10,8 @@ with Client("http://127.0.0.1:8732/drive/?token=...") as client:
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -133,7 +134,7 @@ class Client:
 
     def hold(self, axes: Sequence[float], *, wait: bool = False) -> None:
         """Holds inputs as a page does; they are let go by themselves unless held again within 0.6 s."""
-        self._socket.send(json.dumps({"type": "hold", "axes": list(axes), "wait": wait}))
+        self._send({"type": "hold", "axes": list(axes), "wait": wait})
 
     # --- underneath
 
@@ -142,13 +143,10 @@ class Client:
 
         Raises:
             TeleopRefusal: it was refused.
-            ScenarioError: the connection broke.
+            ScenarioError: the connection broke, or there was no answer in time.
         """
         identity, self._next = self._next, self._next + 1
-        try:
-            self._socket.send(json.dumps({"type": kind, "id": identity, **values}))
-        except Exception as err:
-            raise ScenarioError(f"the connection to the simulator broke: {err}") from None
+        self._send({"type": kind, "id": identity, **values})
         while True:
             said = self._receive()
             if isinstance(said, bytes):
@@ -164,7 +162,7 @@ class Client:
             if message["type"] == "cameras":
                 self._cameras = message["names"]
             elif message["type"] == "shown":
-                self._socket.send(json.dumps({"type": "seen"}))
+                self._send({"type": "seen"})
 
     def _stateful(self, kind: str, **values: Any) -> dict[str, Any]:
         said = self.ask(kind, state=True, **values)
@@ -172,16 +170,18 @@ class Client:
             self.state = {"bodies": said["bodies"], "low_dim": said["low_dim"]}
         return self.status
 
-    def _receive(self) -> str | bytes:
-        from websockets.exceptions import WebSocketException
+    def _send(self, message: Mapping[str, Any]) -> None:
+        with _connection():
+            self._socket.send(json.dumps(message))
 
-        try:
-            return self._socket.recv(timeout=self._timeout_s)
-        except (OSError, WebSocketException, TimeoutError) as err:
-            raise ScenarioError(
-                f"the simulator's server did not answer ({type(err).__name__}: {err}). What it had called "
-                "saved is on its disk; start it again"
-            ) from None
+    def _receive(self) -> str | bytes:
+        with _connection():
+            try:
+                return self._socket.recv(timeout=self._timeout_s)
+            except TimeoutError:
+                raise ScenarioError(
+                    f"the simulator's server did not answer within {self._timeout_s:g} s. {_REMEDY}"
+                ) from None
 
     def close(self) -> None:
         """Ends the connection; a recording under way stays with the server."""
@@ -194,3 +194,19 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+_REMEDY = "What it had called saved is on its disk; start it again"
+
+
+@contextmanager
+def _connection() -> Iterator[None]:
+    """One message for a connection that breaks, whether it is noticed in sending or in receiving."""
+    from websockets.exceptions import WebSocketException
+
+    try:
+        yield
+    except (OSError, WebSocketException) as err:
+        raise ScenarioError(
+            f"the connection to the simulator's server broke ({type(err).__name__}: {err}). {_REMEDY}"
+        ) from None
