@@ -217,3 +217,18 @@ def test_a_dry_run_lists_the_rollouts(tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "4 rollouts; dry run: nothing was run"
     assert not (tmp_path / "x.work").exists()
+
+
+@pytest.mark.libero
+def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, capsys):
+    command = ["collect", "--env.type=roborecover_libero", "--expert=scripted", "--init-states=0"]
+    command += ["--dry-run", f"--out={tmp_path / 'out'}"]
+    assert main([*command, "--task=libero_goal"]) == 0
+    said = capsys.readouterr()
+    assert "8 rollouts" in said.out
+    assert "libero_goal/turn_on_the_stove (nothing is to be picked and placed: turnon" in said.err
+    assert "libero_goal/open_the_middle_drawer_of_the_cabinet (" in said.err
+    assert main([*command, "--task=libero_goal/turn_on*"]) == 2
+    said = capsys.readouterr().err
+    assert "can drive none of these tasks" in said
+    assert "--policy.path=CHECKPOINT" in said

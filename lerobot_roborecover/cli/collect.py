@@ -81,7 +81,7 @@ def pass_through(argv: Sequence[str]) -> int:
     args, rest = parser.parse_known_args(_pairs(argv))
     options = _options(parser, args, rest)
     if args.dry_run:
-        units = plan(options)
+        units = plan(options, lambda line: print(line, file=sys.stderr))
         for unit in units:
             print(f"{unit.id}  {unit.task.suite}/{unit.task.name}")
         print(f"{len(units)} rollouts; dry run: nothing was run")

@@ -60,6 +60,23 @@ def libero_tasks() -> dict[str, list[str]]:
     return {suite: list(module.libero_task_map[suite]) for suite in LIBERO_SUITES}
 
 
+def libero_goal(suite: str, name: str) -> list[list[str]]:
+    """A LIBERO task's goal predicates, each with its arguments: `["on", "plate_1", "..."]`.
+
+    Raises:
+        SimulatorError: hf-libero lacks the task's file, or its goal is no conjunction.
+    """
+    from bddl.parsing import scan_tokens
+
+    path = package_root() / "bddl_files" / suite / f"{name}.bddl"
+    if not path.is_file():
+        raise SimulatorError(f"hf-libero has no {path}; install hf-libero==0.1.4")
+    goals = [part[1] for part in scan_tokens(filename=str(path)) if part[0] == ":goal"]
+    if len(goals) != 1 or goals[0][0] != "and":
+        raise SimulatorError(f"{path} has the goal {goals!r:.200}, which is not `(And ...)`")
+    return goals[0][1:]
+
+
 def libero_instruction(name: str) -> str:
     """The instruction LIBERO derives from a task's name: underscores to spaces, no scene prefix."""
     return re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")

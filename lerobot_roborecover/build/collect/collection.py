@@ -12,12 +12,13 @@ Each of these goes on where it was stopped, and gives the same whatever the numb
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.build.candidates import read_candidates
+from lerobot_roborecover.build.collect.experts import cannot_drive
 from lerobot_roborecover.build.collect.judge import verdict
 from lerobot_roborecover.build.collect.options import CollectOptions
 from lerobot_roborecover.build.collect.record import rollout_id
@@ -34,7 +35,7 @@ from lerobot_roborecover.build.collect.write import read_about
 from lerobot_roborecover.build.funnel import FunnelRow, format_funnel, funnel, read_decisions
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import RunSpec
-from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.scenario import Scenario, ScenarioError, Task
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def collect(options: CollectOptions, say: Callable[[str], None] = print) -> Coll
     """
     options.check()
     env, spec = _env(options)
-    units = _units(options, getattr(env, "robotwin_root", None) or None)
+    units = _units(options, env, say)
     work = options.work or options.out.with_name(f"{options.out.name}.work")
     rolled, about = settings_of(options, spec, units)
     finished = _finished(options.out, about)
@@ -103,11 +104,11 @@ def describe(collected: Collected) -> str:
     return "\n".join(lines)
 
 
-def plan(options: CollectOptions) -> list[Scenario]:
-    """The rollouts that `collect` would run; starts nothing."""
+def plan(options: CollectOptions, say: Callable[[str], None] = print) -> list[Scenario]:
+    """The rollouts that `collect` would run; starts nothing. `say` takes lines for people."""
     options.check()
     env, _ = _env(options)
-    return _units(options, getattr(env, "robotwin_root", None) or None)
+    return _units(options, env, say)
 
 
 def _env(options: CollectOptions) -> tuple[Any, RunSpec]:
@@ -134,13 +135,35 @@ def _env(options: CollectOptions) -> tuple[Any, RunSpec]:
     return env, env.run_spec()
 
 
-def _units(options: CollectOptions, robotwin_root: str | None) -> list[Scenario]:
-    tasks = choose_tasks(all_tasks(options.platform, robotwin_root), options.tasks)
+def _units(options: CollectOptions, env: Any, say: Callable[[str], None]) -> list[Scenario]:
+    root = getattr(env, "robotwin_root", None) or None
+    tasks = choose_tasks(all_tasks(options.platform, root), options.tasks)
+    if options.expert:
+        tasks = _drivable(options.expert, tasks, say)
     if options.horizon:
         tasks = [replace(task, horizon=options.horizon) for task in tasks]
     return make_units(
         tasks, options.starts, driver_of(options), settle_action(options.platform), perturbed=options.perturb
     )
+
+
+def _drivable(expert: str, tasks: Sequence[Task], say: Callable[[str], None]) -> list[Task]:
+    """Tasks that the scripted driver can try; says which are left out, and why.
+
+    Raises:
+        ScenarioError: there is none.
+    """
+    why_not = {task: cannot_drive(task) for task in tasks}
+    able = [task for task, why in why_not.items() if not why]
+    left_out = [f"{task.suite}/{task.name} ({why})" for task, why in why_not.items() if why]
+    if not able:
+        raise ScenarioError(
+            f"--expert {expert} can drive none of these tasks: {'; '.join(left_out)}. Choose others with "
+            "--task, or collect from a policy with --policy.path=CHECKPOINT"
+        )
+    if left_out:
+        say(f"left out, because {expert} cannot drive them: {'; '.join(left_out)}")
+    return able
 
 
 def _finished(out: Path, about: Mapping[str, Any]) -> Collected | None:

@@ -43,6 +43,19 @@ def check_expert(platform: str, name: str) -> None:
     raise ScenarioError(f"--expert {name!r:.80}: {platform} has {there}")
 
 
+def cannot_drive(task: Task) -> str:
+    """Why the scripted drivers of a task's platform cannot do it at all; empty where they can try."""
+    if task.platform != "libero":
+        return ""
+    from lerobot_roborecover.build.libero.scene import PICK_AND_PLACE
+    from lerobot_roborecover.simulators.catalog import libero_goal
+
+    goal = libero_goal(task.suite, task.name)
+    if any(predicate[0] in PICK_AND_PLACE for predicate in goal):
+        return ""
+    return "nothing is to be picked and placed: " + ", ".join(" ".join(predicate) for predicate in goal)
+
+
 def _metaworld(kind: str) -> MakeDriver:
     def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
         from lerobot_roborecover.build.metaworld import experts

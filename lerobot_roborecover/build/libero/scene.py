@@ -11,6 +11,8 @@ import numpy as np
 from lerobot_roborecover.simulators.libero import LiberoSimulator
 from lerobot_roborecover.simulators.mujoco_state import subtree
 
+PICK_AND_PLACE = ("on", "in")
+"""Predicates of a goal that the driver knows."""
 _BOX = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
 _COLLISION_GROUP = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
@@ -43,7 +45,7 @@ class LiberoScene:
     def goals(self) -> list[Goal]:
         """The goal's pick-and-place predicates, in LIBERO's order."""
         state = self.env.parsed_problem["goal_state"]
-        return [Goal(tuple(p), p[1], p[2]) for p in state if p[0] in ("on", "in")]
+        return [Goal(tuple(p), p[1], p[2]) for p in state if p[0] in PICK_AND_PLACE]
 
     def reached(self, goal: Goal) -> bool:
         """LIBERO's own verdict on one predicate."""
