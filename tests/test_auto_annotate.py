@@ -10,8 +10,7 @@ from candidate_files import candidate_dataset
 from lerobot_roborecover.build.annotate.serve import AnnotateConfig
 from lerobot_roborecover.build.annotate.votes import ballot, read_votes, votes_folder
 from lerobot_roborecover.build.auto_annotate.annotators import EYES, label_kind
-from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
-from lerobot_roborecover.build.auto_annotate.page import look_every
+from lerobot_roborecover.build.auto_annotate.looking import LOOK_S, Look, Sheet, frames_to_look_at
 from lerobot_roborecover.build.auto_annotate.rules import Verdict, judge
 from lerobot_roborecover.build.auto_annotate.run import annotate
 from lerobot_roborecover.build.candidates import read_candidates
@@ -38,7 +37,7 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
     first = next(iter(whole.values()))
     speed = (np.abs(np.gradient(first["reach"])) + np.abs(np.gradient(first["moved"]))) * FPS
     look = Look(Sheet("it", "do it", LAST, FPS, solved, human))
-    for f in sorted({*range(EYES[eye].first_frame, LAST + 1, look_every(FPS)), LAST}):
+    for f in frames_to_look_at(EYES[eye].first_look, FPS, LAST):
         look.readings[f] = {
             "hand": {"speed": float(speed[f]), "a3": float(closed[f])},
             **{n: {k: float(v[f]) for k, v in values.items()} for n, values in whole.items()},
@@ -47,9 +46,15 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
 
 
 @pytest.mark.parametrize("fps", [10, 20, 80, 400])
-def test_looks_follow_the_clock_and_not_the_frames(fps):
-    assert look_every(fps) / fps == pytest.approx(0.125, abs=0.5 / fps + 1e-9)
-    assert look_every(1) == 1
+@pytest.mark.parametrize("eye", EYES)
+def test_looks_follow_the_clock_and_not_the_frames(fps, eye):
+    frames = frames_to_look_at(EYES[eye].first_look, fps, 10 * fps)
+    (step,) = set(np.diff(frames[:-1]).tolist())
+    assert step / fps == pytest.approx(LOOK_S, abs=0.5 / fps + 1e-9)
+    assert frames[0] < max(step, 2)
+    assert frames[-1] == 10 * fps
+    assert frames_to_look_at(EYES[eye].first_look, fps, 0) == [0]
+    assert frames_to_look_at(EYES[eye].first_look, 1, 2)[-3:] in ([0, 1, 2], [1, 2])
 
 
 def test_where_no_goal_is_shown_the_object_is_the_one_that_ends_farthest_from_its_place():

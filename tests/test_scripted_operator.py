@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_roborecover.build.annotate.traces import traces
 from lerobot_roborecover.build.auto_annotate.annotators import EYES
-from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
+from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet, frames_to_look_at
 from lerobot_roborecover.build.auto_annotate.rules import judge
 from lerobot_roborecover.build.candidates import Steps
 from lerobot_roborecover.scenario import Reset
@@ -51,7 +51,7 @@ class Recorder:
         steps = Steps(poses, np.array(self.solved), np.zeros(count, np.int8))
         shown = traces("metaworld", np.array(self.actions), steps, 80)
         look = Look(Sheet("it", "", count - 1, 80.0, False, human=True))
-        for f in range(EYES[eye].first_frame, count, 10):
+        for f in frames_to_look_at(EYES[eye].first_look, 80, count - 1):
             hand = {"speed": shown.eef_speed_m_s[f], "a3": shown.gripper["a3"][f]}
             look.readings[f] = {"hand": hand}
             for name, place in shown.places.items():

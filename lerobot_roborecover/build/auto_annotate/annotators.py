@@ -14,8 +14,8 @@ PREFIX = "auto-"
 class Eye:
     """How one annotator looks and where it draws the line; metres and seconds."""
 
-    first_frame: int = 0
-    """Where it begins to look."""
+    first_look: float = 0.0
+    """When it first looks, as a share of the time from one look to the next."""
     contact_m: float = 0.10
     """The hand is at the object within this, and has to approach it beyond."""
     place_m: float = 0.10
@@ -43,11 +43,11 @@ class Eye:
 EYES: Mapping[str, Eye] = {
     "auto-1": Eye(),
     "auto-2": Eye(
-        first_frame=3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018,
+        first_look=0.3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018,
         event_m=0.04,
     ),
     "auto-3": Eye(
-        first_frame=6, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
+        first_look=0.6, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
         stuck_m=0.012, event_m=0.06, stable_s=0.4,
     ),
 }  # fmt: skip

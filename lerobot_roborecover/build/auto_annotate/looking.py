@@ -9,6 +9,20 @@ import numpy as np
 
 HAND = "hand"
 """Row of the readout with the end effector's speed and the commanded gripper."""
+LOOK_S = 0.125
+"""From one look to the next: ten frames of Meta-World, two of LIBERO."""
+
+
+def frames_to_look_at(first_look: float, fps: float, last: int) -> list[int]:
+    """Frames of an episode at which an annotator looks, the last among them; by the clock, whatever the rate.
+
+    Args:
+        first_look: as `Eye.first_look`.
+        fps: frames a second.
+        last: number of the last frame.
+    """
+    every = max(round(LOOK_S * fps), 1)
+    return sorted({*range(round(first_look * every), last + 1, every), last})
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,10 @@ from typing import Any
 from lerobot_roborecover.build.annotate.guide import STAGES, TYPES
 from lerobot_roborecover.build.annotate.votes import DISCARD_REASONS
 from lerobot_roborecover.build.auto_annotate.annotators import Eye
-from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet
+from lerobot_roborecover.build.auto_annotate.looking import Look, Sheet, frames_to_look_at
 from lerobot_roborecover.build.auto_annotate.rules import Verdict, judge
 from lerobot_roborecover.scenario import ScenarioError
 
-LOOK_S = 0.125
-"""From one look to the next: ten frames of Meta-World, two of LIBERO."""
 WAIT_S = 120.0
 """Longest that a frame or an episode may take."""
 
@@ -44,11 +42,6 @@ _AT_END = """() => {
   const [at, last] = document.querySelector("#frame").textContent.split(" / ").map(Number);
   return at === last && Number(document.querySelector("#readout").dataset.step) === last;
 }"""
-
-
-def look_every(fps: float) -> int:
-    """Frames from one look to the next, at least one."""
-    return max(round(LOOK_S * fps), 1)
 
 
 class Annotator:
@@ -108,13 +101,9 @@ class Annotator:
         )
 
     def _look_along(self, look: Look) -> None:
-        every = look_every(look.sheet.fps)
-        self._go(min(self._eye.first_frame % every, look.sheet.last))
-        while True:
-            look.readings[self._at] = self._read(self._at)
-            if self._at == look.sheet.last:
-                return
-            self._go(min(self._at + every, look.sheet.last))
+        for frame in frames_to_look_at(self._eye.first_look, look.sheet.fps, look.sheet.last):
+            self._go(frame)
+            look.readings[frame] = self._read(frame)
 
     def _look_closer(self, look: Look, step: int) -> None:
         """Every frame from the look before the point up to it."""

@@ -10,15 +10,11 @@ person where nobody can be asked, such as in the study that anyone re-runs; its 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
-import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +23,7 @@ from lerobot_roborecover.build.collect.starts import parse_numbers
 from lerobot_roborecover.build.metaworld.dataset import STUDY_TASKS
 from lerobot_roborecover.build.metaworld.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from lerobot_roborecover.build.metaworld.experts import expert, patient_expert
+from lerobot_roborecover.build.speaker import Speaker
 from lerobot_roborecover.build.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.build.teleop.serve import TeleopConfig, serve
 from lerobot_roborecover.build.teleop.starts import StartPoint, first_state
@@ -39,7 +36,6 @@ FILM_EVERY = 16
 """Steps from one picture of the dataset to the next: software rendering is slow."""
 START_S = 300.0
 _ATTEMPT_SEEDS = (1, 2)
-_ERROR = "error: "
 
 
 class Remote:
@@ -146,53 +142,17 @@ def record(
 
 @contextmanager
 def _server(config: TeleopConfig) -> Iterator[str]:
-    """The server as a process of its own; interrupted at the end, it writes the dataset."""
-    context = multiprocessing.get_context("spawn")
-    mine, its = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(config, its))
-    process.start()
-    its.close()
-    try:
-        yield _address(mine)
-        os.kill(process.pid or 0, signal.SIGINT)
-        _follow(mine)
-        process.join()
-    finally:
-        if process.is_alive():
-            process.terminate()
-            process.join(10)
-
-
-def _address(lines: Connection) -> str:
-    until = time.monotonic() + START_S
-    while lines.poll(max(until - time.monotonic(), 0.0)):
-        line = _line(lines)
-        if line is None:
-            break
-        if line.startswith(_ERROR):
-            raise ScenarioError(line.removeprefix(_ERROR))
-        if "http://" in line:
-            return line.split()[-1]
-    raise ScenarioError("the teleoperation server did not start")
-
-
-def _follow(lines: Connection) -> None:
-    while (line := _line(lines)) is not None:
-        print(line, flush=True)
-
-
-def _line(lines: Connection) -> str | None:
-    try:
-        return lines.recv()
-    except EOFError:
-        return None
-
-
-def _serve(config: TeleopConfig, said: Connection) -> None:
-    try:
-        serve(config, said.send)
-    except (ScenarioError, KeyboardInterrupt) as err:
-        said.send(f"{_ERROR}{err}")
+    """The server's address; interrupted at the end, it writes the dataset."""
+    with Speaker("the teleoperation server", serve, config) as server:
+        until, line = time.monotonic() + START_S, ""
+        while "http://" not in line:
+            line = server.hear(until) or ""
+            if not line:
+                raise ScenarioError("the teleoperation server ended before it gave an address")
+        yield line.split()[-1]
+        server.interrupt()
+        while line := server.hear() or "":
+            print(line, flush=True)
 
 
 def main() -> None:
