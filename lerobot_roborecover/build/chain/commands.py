@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -146,3 +146,13 @@ def publish_command(config: ChainConfig, places: Places) -> list[str]:
     if config.publish is None:
         return [*argv, "--repo-id", "ORG/NAME"]
     return argv + flags(vars(config.publish), ("repo_id", "version", "private", "title", "no_pictures"))
+
+
+COMMANDS: Mapping[str, Callable[[ChainConfig, Places], list[str]]] = {
+    "agree": agree_command,
+    "screen": screen_command,
+    "validate": validate_command,
+    "split": split_command,
+    "publish": publish_command,
+}
+"""Arguments of the stages that are one command on the result of the one before."""

@@ -29,11 +29,11 @@ from lerobot_roborecover.build.chain.config import ChainConfig
 from lerobot_roborecover.build.funnel import read_decisions
 from lerobot_roborecover.build.journal import Journal, read_journal
 from lerobot_roborecover.build.resolution import ResolutionConfig, queued, resolve, write_discussion
-from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.write import file_sha256
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import new_folder
 
 STAGES = ("collect", "join", "annotate", "agree", "screen", "validate", "split", "publish")
 JOURNAL_FILE = "stages.jsonl"
@@ -155,31 +155,21 @@ class Chain:
         )
         yield Stage("annotate", "annotate", None, None, self._annotate, not self._open())
         votes = {p.name: file_sha256(p) for p in sorted(places.votes.glob("*.jsonl"))}
-        yield Stage(
-            "agree", "agree", places.scenarios, [_options(config.annotate), votes, config.license],
-            lambda: self._command(commands.agree_command(config, places)),
-        )  # fmt: skip
-        yield Stage(
-            "screen", "screen", places.screened, _options(config.screen),
-            lambda: self._command(commands.screen_command(config, places)),
-        )  # fmt: skip
+        yield self._simple("agree", places.scenarios, [_options(config.annotate), votes, config.license])
+        yield self._simple("screen", places.screened, _options(config.screen))
         rejects = Path(config.validate.rejects) if config.validate.rejects else None
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"
         # `validate` itself leaves an empty record of rejections behind.
         looked = [file_sha256(p) for p in (rejects, people) if p and p.is_file() and p.stat().st_size]
-        yield Stage(
-            "validate", "validate", places.validated, [_options(config.validate), looked],
-            lambda: self._command(commands.validate_command(config, places)),
-        )  # fmt: skip
-        yield Stage(
-            "split", "split", places.split, _options(config.split),
-            lambda: self._command(commands.split_command(config, places)),
-        )  # fmt: skip
+        yield self._simple("validate", places.validated, [_options(config.validate), looked])
+        yield self._simple("split", places.split, _options(config.split))
         if config.publish is not None:
-            yield Stage(
-                "publish", "publish", None, _options(config.publish),
-                lambda: self._command(commands.publish_command(config, places)),
-            )  # fmt: skip
+            yield self._simple("publish", None, _options(config.publish))
+
+    def _simple(self, name: str, out: Path | None, identity: Any) -> Stage:
+        """A stage that is one command on the result of the one before."""
+        command = commands.COMMANDS[name]
+        return Stage(name, name, out, identity, lambda: self._command(command(self.config, self.places)))
 
     def _command(self, argv: list[str], fine: tuple[int, ...] = (0,)) -> None:
         self.say(f"$ roborecover {shlex.join(argv)}")

@@ -12,6 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ class Screened:
     scenario: Scenario
     counts: Mapping[str, PolicyCount]
     """By the policy's name in this screening."""
-    decision: Decision
+    rule: ScreenRule
 
     @property
     def successes(self) -> int:
@@ -120,7 +121,32 @@ class Screened:
     @property
     def invalid(self) -> Counter[str]:
         """Invalid trials of all policies, by outcome."""
-        return _all_invalid(self.counts)
+        found: Counter[str] = Counter()
+        for count in self.counts.values():
+            found.update({outcome: n * count.each_counts for outcome, n in count.invalid.items()})
+        return found
+
+    @cached_property
+    def decision(self) -> Decision:
+        """Whether it stays, and why not."""
+        low, high = self.rule.check(len(self.counts))
+        each = ", ".join(
+            f"{name} {c.successes}/{c.trials}{f' (x {c.each_counts})' if c.each_counts > 1 else ''}"
+            for name, c in self.counts.items()
+        )
+        detail = f"{self.successes} of {self.trials} successes ({each}); {low} to {high} stay"
+        if self.invalid:
+            named = sorted(self.invalid.items())
+            detail += "; invalid: " + ", ".join(f"{n} {outcome}" for outcome, n in named)
+        reason = ""
+        if self.invalid.total() > self.rule.max_invalid:
+            reason = f"invalid trials: {', '.join(sorted(self.invalid))}"
+        elif self.successes > high:
+            reason = "too easy"
+        elif self.successes < low:
+            reason = "too hard"
+        by = f"{self.trials} trials of {len(self.counts)} policies"
+        return Decision(self.scenario.id, "screen", "dropped" if reason else "kept", reason, detail, by)
 
 
 def screen(
@@ -144,7 +170,7 @@ def screen(
     Raises:
         ScenarioError: a scenario lacks a trial of a policy, or two trials of a deterministic one differ.
     """
-    low, high = rule.check(len(rows))
+    rule.check(len(rows))
     of: dict[tuple[str, str, str], dict[int, TrialRow]] = defaultdict(dict)
     for name, given in rows.items():
         for row in given:
@@ -155,17 +181,17 @@ def screen(
         counts = {}
         for name in sorted(rows):
             mine = of[name, scenario.id, scenario.sha256()]
+            found, each_counts = [mine[trial] for trial in sorted(mine)], 1
             needed = 1 if name in deterministic else rule.trials
-            if len(mine) < needed:
+            if len(found) < needed:
                 raise ScenarioError(
-                    f"scenario {scenario.id} has {len(mine)} of {needed} trials by {name}; run the "
+                    f"scenario {scenario.id} has {len(found)} of {needed} trials by {name}; run the "
                     "command again to finish them"
                 )
-            found = [mine[trial] for trial in sorted(mine)]
             if name in deterministic:
-                found = [_the_one(name, found)]
-            counts[name] = _count(found, rule.trials // needed if name in deterministic else 1)
-        result.append(Screened(scenario, counts, _decide(scenario.id, counts, rule, low, high)))
+                found, each_counts = [_the_one(name, found)], rule.trials
+            counts[name] = _count(found, each_counts)
+        result.append(Screened(scenario, counts, rule))
     return result
 
 
@@ -193,45 +219,12 @@ def _count(rows: Sequence[TrialRow], each_counts: int) -> PolicyCount:
     )
 
 
-def _decide(
-    scenario_id: str, counts: Mapping[str, PolicyCount], rule: ScreenRule, low: int, high: int
-) -> Decision:
-    invalid = _all_invalid(counts)
-    won = sum(c.successes * c.each_counts for c in counts.values())
-    total = sum(c.trials * c.each_counts for c in counts.values())
-    each = ", ".join(
-        f"{name} {c.successes}/{c.trials}{f' (x {c.each_counts})' if c.each_counts > 1 else ''}"
-        for name, c in counts.items()
-    )
-    detail = f"{won} of {total} successes ({each}); {low} to {high} stay"
-    if invalid:
-        detail += "; invalid: " + ", ".join(f"{n} {outcome}" for outcome, n in sorted(invalid.items()))
-    reason = ""
-    if invalid.total() > rule.max_invalid:
-        reason = f"invalid trials: {', '.join(sorted(invalid))}"
-    elif won > high:
-        reason = "too easy"
-    elif won < low:
-        reason = "too hard"
-    by = f"{total} trials of {len(counts)} policies"
-    return Decision(scenario_id, "screen", "dropped" if reason else "kept", reason, detail, by)
-
-
-def _all_invalid(counts: Mapping[str, PolicyCount]) -> Counter[str]:
-    return Counter(
-        {
-            outcome: sum(c.invalid.get(outcome, 0) * c.each_counts for c in counts.values())
-            for outcome in sorted({outcome for c in counts.values() for outcome in c.invalid})
-        }
-    )
-
-
-def provenance_of(found: Screened, rule: ScreenRule, run_seed: int) -> dict[str, Any]:
+def provenance_of(found: Screened, run_seed: int) -> dict[str, Any]:
     """What a scenario keeps of its screening."""
     return {
         "successes": found.successes,
         "trials": found.trials,
-        "keep": list(rule.check(len(found.counts))),
+        "keep": list(found.rule.check(len(found.counts))),
         "run_seed": run_seed,
         "policies": {name: asdict(count) for name, count in found.counts.items()},
     }
