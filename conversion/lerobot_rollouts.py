@@ -19,12 +19,12 @@ import numpy as np
 
 from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
-from lerobot_roborecover.datasets.new_folder import check_new, new_folder
 from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
 from lerobot_roborecover.scenario import PLATFORM_ACTION_DIMS, ScenarioError, Task
 from lerobot_roborecover.simulators import SimulatorError
+from lerobot_roborecover.whole import check_new, new_folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:

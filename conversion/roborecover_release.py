@@ -21,7 +21,6 @@ from typing import Any
 
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
-from lerobot_roborecover.datasets.new_folder import check_new
 from lerobot_roborecover.datasets.release.convert import (
     Conversion,
     Problem,
@@ -38,6 +37,7 @@ from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.simulators import SimulatorError
 from lerobot_roborecover.simulators.robotwin_checkout import RobotwinCheckout
 from lerobot_roborecover.simulators.robotwin_render import QUALITIES
+from lerobot_roborecover.whole import check_new
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import importlib.resources
 import json
-import os
 from pathlib import Path
 
 from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard, as_json, ranks, separated
 from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.whole import write_whole
 
 
 def write_leaderboard(
@@ -34,12 +34,9 @@ def write_leaderboard(
     page = template.render(
         title=title, boards=boards, published=published_table(), refused=found.refused, version=__version__
     )
-    out.mkdir(parents=True, exist_ok=True)
     files = out / "index.html", out / "leaderboard.json"
     for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
-        temporary = path.with_name(f".{path.name}.tmp")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        write_whole(path, text)
     return files
 
 

@@ -7,7 +7,6 @@ import hashlib
 import importlib.resources
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.style import render
 from lerobot_roborecover.analysis.summary import Estimate
 from lerobot_roborecover.analysis.tables import Table, to_csv, to_latex, to_markdown
+from lerobot_roborecover.whole import write_whole
 
 REPORT_SCHEMA = 1
 
@@ -91,20 +91,22 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
     images: dict[str, dict[str, str]] = {}
     for figure in all_figures(results):
         svg, png = render(figure)
-        _write(out / "figures" / f"{figure.name}.svg", svg)
-        _write(out / "figures" / f"{figure.name}.png", png)
+        write_whole(out / "figures" / f"{figure.name}.svg", svg)
+        write_whole(out / "figures" / f"{figure.name}.png", png)
         uri = f"data:image/svg+xml;base64,{base64.b64encode(svg).decode()}"
         images[figure.name] = {"uri": uri, "title": figure.title, "text": figure.description}
     for table in tables:
-        _write(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
-        _write(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
+        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
+        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
     provenance = provenance_of(results, extras.command)
-    _write(
+    write_whole(
         out / "results.json", json.dumps(_as_json(results, tables, remarks, provenance), indent=1).encode()
     )
-    _write(out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode())
+    write_whole(out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode())
     cards = make_cards(results.recovery, extras.frames, extras.clips)
-    _write(out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode())
+    write_whole(
+        out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
+    )
     return ReportFiles(out / "report.html", out / "report.md", out / "results.json", tuple(tables))
 
 
@@ -240,10 +242,3 @@ def _html(results, tables, images, cards: list[Card], remarks, provenance, extra
         provenance=json.dumps(provenance, indent=1),
         several=len(results.recovery.arms) > 1,
     )
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_metadata, write_trajectories
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import new_file, new_folder, write_whole
 
 
 @dataclass(frozen=True)
@@ -79,19 +79,13 @@ def write_candidates(
             yield recording.trajectory
             kept.append(recording)
 
-    def finish(temporary: Path) -> None:
+    with new_folder(root) as folder:
+        write_trajectories(folder, "rollouts", draw(), fps=fps, description=description, license=license)
         candidates = [r.candidate for r in kept]
-        check_candidates(str(root), candidates, read_trajectories(temporary).rows)
-        write_candidate_metadata(temporary, candidates, [r.steps for r in kept], versions)
-        record_decisions(temporary, (_collected(r) for r in kept))
-
-    return _appear(
-        root,
-        lambda temporary: write_trajectories(
-            temporary, "rollouts", draw(), fps=fps, description=description, license=license
-        ),
-        finish,
-    )
+        check_candidates(str(root), candidates, read_trajectories(folder).rows)
+        write_candidate_metadata(folder, candidates, [r.steps for r in kept], versions)
+        record_decisions(folder, (_collected(r) for r in kept))
+    return root
 
 
 def merge_candidates(root: str | os.PathLike[str], sources: Sequence[Path]) -> Path:
@@ -122,21 +116,19 @@ def merge_candidates(root: str | os.PathLike[str], sources: Sequence[Path]) -> P
     manifests = [s.trajectories.manifest for s in sets]
     licenses = {m.get("license") for m in manifests}
 
-    def join(temporary: Path) -> None:
+    candidates = [c for s in sets for c in s.candidates]
+    rows = [r for s in sets for r in s.trajectories.rows]
+    with new_folder(root) as folder:
         try:
             aggregate_datasets(
                 [f"roborecover/{s.root.name}" for s in sets], f"roborecover/{root.name}",
-                [s.root for s in sets], temporary,
+                [s.root for s in sets], folder,
             )  # fmt: skip
         except ValueError as err:
             raise ScenarioError(f"the datasets cannot be joined: {err}") from err
-
-    def finish(temporary: Path) -> None:
-        candidates = [c for s in sets for c in s.candidates]
-        rows = [r for s in sets for r in s.trajectories.rows]
         check_candidates(str(root), candidates, rows)
         write_metadata(
-            temporary,
+            folder,
             "rollouts",
             [],
             rows,
@@ -144,10 +136,9 @@ def merge_candidates(root: str | os.PathLike[str], sources: Sequence[Path]) -> P
             license=licenses.pop() if len(licenses) == 1 else None,
         )
         steps = (s.steps(episode) for s in sets for episode in range(len(s)))
-        write_candidate_metadata(temporary, candidates, steps, sets[0].versions)
-        record_decisions(temporary, (d for s in sets for d in read_decisions(s.root)))
-
-    return _appear(root, join, finish)
+        write_candidate_metadata(folder, candidates, steps, sets[0].versions)
+        record_decisions(folder, (d for s in sets for d in read_decisions(s.root)))
+    return root
 
 
 def write_candidate_metadata(
@@ -165,9 +156,11 @@ def write_candidate_metadata(
     text = json.dumps(document, ensure_ascii=False, allow_nan=False) + "\n"
     if len(text.encode()) > MAX_CANDIDATES_BYTES:
         raise ScenarioError(f"{CANDIDATES_FILE} would exceed {MAX_CANDIDATES_BYTES} bytes; split the dataset")
-    temporary = folder / f".{STEPS_FILE}.{os.getpid()}.tmp"
     # One row group an episode: a page reads one without decoding a thousand.
-    with pq.ParquetWriter(temporary, STEPS_SCHEMA, compression="zstd") as writer:
+    with (
+        new_file(folder / STEPS_FILE) as path,
+        pq.ParquetWriter(path, STEPS_SCHEMA, compression="zstd") as writer,
+    ):
         for episode, step in enumerate(steps):
             row = {
                 "episode_index": episode,
@@ -178,28 +171,7 @@ def write_candidate_metadata(
             }
             columns = [pa.array([row[f.name]], f.type) for f in STEPS_SCHEMA]
             writer.write_table(pa.Table.from_arrays(columns, schema=STEPS_SCHEMA))
-    os.replace(temporary, folder / STEPS_FILE)
-    temporary = folder / f".{CANDIDATES_FILE}.{os.getpid()}.tmp"
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, folder / CANDIDATES_FILE)
-
-
-def _appear(root: Path, write, finish) -> Path:
-    """Makes a dataset beside its place and puts it there once all of it is written."""
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise ScenarioError(f"{root} is not an empty folder; write a dataset with episodes to a new one")
-    root.parent.mkdir(parents=True, exist_ok=True)
-    temporary = root.with_name(f".{root.name}.{os.getpid()}.whole")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        write(temporary)
-        finish(temporary)
-        if root.exists():
-            root.rmdir()
-        os.replace(temporary, root)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return root
+    write_whole(folder / CANDIDATES_FILE, text)
 
 
 def _check_steps(recording: Recording) -> None:

@@ -7,7 +7,6 @@ another, with both on record.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ from typing import Any, Literal, get_args
 from lerobot_roborecover.build.journal import Journal, read_journal
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import new_file
 
 DECISIONS_FILE = "decisions.jsonl"
 SCHEMA_VERSION = 1
@@ -111,11 +111,8 @@ def carry_decisions(source: Path, target: Path) -> None:
     """Copies the decisions so far into the dataset that a stage has made."""
     path = source / FOLDER / DECISIONS_FILE
     if path.is_file():
-        copy = target / FOLDER / DECISIONS_FILE
-        temporary = copy.with_name(f".{copy.name}.{os.getpid()}.tmp")
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, temporary)
-        os.replace(temporary, copy)
+        with new_file(target / FOLDER / DECISIONS_FILE) as copy:
+            shutil.copyfile(path, copy)
 
 
 def standing(decisions: Sequence[Decision], stage: StageName) -> set[str]:

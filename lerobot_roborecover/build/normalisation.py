@@ -7,10 +7,10 @@ own statistics would shift and blow up what the checkpoint's weights have learne
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 _STATS = Path("meta") / "stats.json"
 _PREPROCESSOR = "policy_preprocessor.json"
@@ -58,7 +58,5 @@ def use_statistics_of(root: Path, folder: Path) -> list[str]:
         raise ScenarioError(
             f"{folder} has no statistics of the action; it cannot be trained further on {root}"
         )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(stats, indent=4) + "\n")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps(stats, indent=4) + "\n")
     return sorted(replaced)

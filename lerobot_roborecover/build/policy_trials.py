@@ -23,6 +23,7 @@ from lerobot_roborecover.evaluate.engine import units_of
 from lerobot_roborecover.evaluate.host import Chunk, Host, PolicyError
 from lerobot_roborecover.evaluate.local import LocalEngine
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import new_file
 
 TRIALS_FILE = "trials.jsonl"
 ACTIONS_FOLDER = "actions"
@@ -109,12 +110,8 @@ class _KeepingLog:
     def append(self, row: TrialRow) -> None:
         actions = self._host.executed(row)
         if actions is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            path = actions_path(self._folder, row)
-            temporary = path.with_suffix(f".{os.getpid()}.tmp")
-            with open(temporary, "wb") as file:
+            with new_file(actions_path(self._folder, row)) as path, open(path, "wb") as file:
                 np.save(file, actions, allow_pickle=False)
-            os.replace(temporary, path)
         self._log.append(row)
 
 

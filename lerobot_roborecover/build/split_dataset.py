@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,6 +19,7 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import new_folder, write_whole
 
 SPLIT_FILE = "split.json"
 SCHEMA_VERSION = 1
@@ -166,28 +166,15 @@ def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[
         "counts": dict(report.counts),
         "groups": report.groups,
     }
-    path = root / FOLDER / SPLIT_FILE
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(root / FOLDER / SPLIT_FILE, json.dumps(document, indent=2) + "\n")
     # A set that was not built here has no history to go on with.
     if read_decisions(root):
         record_decisions(root, (Decision(i, "split", "kept", by=f"seed {config.seed}") for i in ids))
 
 
 def _copy(root: Path, out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ScenarioError(f"{out} is not an empty folder; name a new one")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
+    with new_folder(out) as folder:
         for name in list_files(root):
-            target = temporary / name
+            target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(root / name, target)
-        if out.exists():
-            out.rmdir()
-        os.replace(temporary, out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -18,9 +18,9 @@ from lerobot_roborecover.build.funnel import (
 )
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
-from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import new_folder
 
 
 def write_stage(

@@ -16,7 +16,6 @@ from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.hf_api import RepoFile
 
 from lerobot_roborecover.datasets.contents import MAX_FILE_BYTES, check_file, check_names
-from lerobot_roborecover.datasets.new_folder import check_new, new_folder
 from lerobot_roborecover.datasets.retries import again
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
@@ -27,6 +26,7 @@ from lerobot_roborecover.datasets.schema import (
 )
 from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, read_trajectories
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import check_new, new_folder
 
 _EVALUATION = (f"{FOLDER}/{MANIFEST_FILE}", f"{FOLDER}/{SCENARIOS_FILE}")
 _LIMITS = {_EVALUATION[0]: MAX_MANIFEST_BYTES, _EVALUATION[1]: MAX_PARQUET_BYTES}

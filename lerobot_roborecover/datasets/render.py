@@ -7,8 +7,6 @@ without encoding anything again.
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,10 @@ from lerobot_roborecover.datasets.episodes import render_prefix, write_lerobot_d
 from lerobot_roborecover.datasets.fingerprint import run_jobs, simulator_of_worker
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import LastFrames
-from lerobot_roborecover.datasets.new_folder import check_new, new_folder
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.simulators import SimulatorError
+from lerobot_roborecover.whole import check_new, new_folder
 
 _EPISODES_PER_SHARD = 10
 _TRIED = 3
@@ -109,10 +107,8 @@ def _look(scenarios: Sequence[Scenario]) -> None:
 
 def _render_shard(begin: int, scenarios: Sequence[Scenario], path: Path) -> None:
     simulator = simulator_of_worker()
-    temporary = path.with_name(f"{path.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
     last: list[LastFrames] = []
     episodes = (render_prefix(simulator, scenario, last) for scenario in scenarios)
-    write_lerobot_dataset(temporary, scenarios, episodes, round(simulator.control_hz), first_index=begin)
-    write_scenarios(temporary, scenarios, frames=last)
-    os.replace(temporary, path)
+    with new_folder(path) as folder:
+        write_lerobot_dataset(folder, scenarios, episodes, round(simulator.control_hz), first_index=begin)
+        write_scenarios(folder, scenarios, frames=last)

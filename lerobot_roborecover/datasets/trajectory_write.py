@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import (
     KINDS,
@@ -35,6 +34,7 @@ from lerobot_roborecover.scenario import (
     ScenarioError,
     Task,
 )
+from lerobot_roborecover.whole import new_folder, write_whole
 
 type Frame = Mapping[str, np.ndarray]
 """One time step by LeRobot feature name, as `episodes.to_frame` gives it."""
@@ -283,8 +283,4 @@ def write_metadata(
         raise ScenarioError(
             f"{TRAJECTORIES_FILE} would exceed {MAX_TRAJECTORIES_BYTES} bytes; split the dataset"
         )
-    folder = root / FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".{TRAJECTORIES_FILE}.{os.getpid()}.tmp"
-    temporary.write_text(text + "\n", encoding="utf-8")
-    os.replace(temporary, folder / TRAJECTORIES_FILE)
+    write_whole(root / FOLDER / TRAJECTORIES_FILE, text + "\n")

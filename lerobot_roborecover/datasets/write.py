@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 from lerobot_roborecover import __version__
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, write_frames
 from lerobot_roborecover.datasets.frames import LastFrames
-from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
     MANIFEST_FILE,
@@ -31,6 +30,7 @@ from lerobot_roborecover.datasets.schema import (
     to_row,
 )
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import new_file, new_folder, write_whole
 
 _ROWS_PER_GROUP = 64
 """Rows converted at a time: bounds memory where scenarios carry frames."""
@@ -91,7 +91,8 @@ def _write_folder(
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         names = write_frames(temporary, frames)
-        _replace(folder / SCENARIOS_FILE, lambda file: _write_parquet(file, scenarios))
+        with new_file(folder / SCENARIOS_FILE) as path, open(path, "wb") as file:
+            _write_parquet(file, scenarios)
         shutil.rmtree(folder / FRAMES_FOLDER, ignore_errors=True)
         if names:
             os.replace(temporary, folder / FRAMES_FOLDER)
@@ -112,7 +113,7 @@ def _write_folder(
         },
     }
     text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
-    _replace(folder / MANIFEST_FILE, lambda file: file.write(text.encode()))
+    write_whole(folder / MANIFEST_FILE, text)
 
 
 def _write_dataset(
@@ -185,17 +186,3 @@ def _write_parquet(file: IO[bytes], scenarios: Sequence[Scenario]) -> None:
             f"{SCENARIOS_FILE} would have {file.tell()} bytes; the limit is {MAX_PARQUET_BYTES}. "
             "Leave out fingerprint frames, or split the set"
         )
-
-
-def _replace(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Writes a file under a temporary name beside its place, flushes it to disk, and puts it there."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

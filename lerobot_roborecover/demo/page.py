@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import importlib.resources
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW, Estimate, Summary
 from lerobot_roborecover.scenario import Outcome, Scenario, Start
+from lerobot_roborecover.whole import write_whole
 
 _TITLES = {Start.RECOVERY: "recovery point", Start.INITIAL: "initial state"}
 
@@ -87,9 +87,7 @@ def write_page(
         versions={"roborecover": __version__, **versions},
         finished=max((row["finished_at"] for row in rows), default=""),
     )
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
     return path
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.simulators import Simulator, SimulatorError, make_simulator
+from lerobot_roborecover.whole import write_whole
 
 SIZE = 240
 """Width and height of a frame, pixels."""
@@ -56,9 +57,7 @@ def _render(scenarios: Sequence[Scenario], files: dict[str, Path]) -> str:
             except SimulatorError as err:
                 problem = problem or f"{scenario_id}: {err}"
                 continue
-            temporary = files[scenario_id].with_suffix(".tmp")
-            temporary.write_bytes(data)
-            os.replace(temporary, files[scenario_id])
+            write_whole(files[scenario_id], data)
     except BrokenProcessPool:
         problem = "a rendering process died, which an OpenGL driver can cause; see 'roborecover doctor'"
     except FutureTimeout:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib.resources
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
+from lerobot_roborecover.whole import write_whole
 
 SCENARIOS = "metaworld_starter"
 TRIALS = 1
@@ -91,9 +91,7 @@ def claim_folder(settings: DemoSettings) -> None:
                     f"not {fixed[other[0]]!r}. Give this one a folder of its own: --out FOLDER"
                 )
             return
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(fixed, indent=2) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
+        write_whole(path, json.dumps(fixed, indent=2) + "\n")
     except (OSError, ValueError, AttributeError) as err:
         raise DemoError(
             f"cannot use {settings.out} for the demo's output: {err}. Choose another with --out"

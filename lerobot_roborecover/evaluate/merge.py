@@ -4,13 +4,12 @@ it."""
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, parse_rows, read_trial_log
+from lerobot_roborecover.whole import new_file
 
 
 def protocol_of(row: TrialRow) -> dict[str, object]:
@@ -97,10 +96,6 @@ def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False) -> list[Tri
                 "is unfinished or missing: run it with its own log, or accept it with --unequal"
             )
     rows.sort(key=lambda r: (r.scenario_id, r.start, r.policy, r.trial))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=out.parent, delete=False, encoding="utf-8") as file:
+    with new_file(out) as path, open(path, "w", encoding="utf-8") as file:
         file.writelines(json.dumps(asdict(row), allow_nan=False) + "\n" for row in rows)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, out)
     return rows

@@ -8,12 +8,12 @@ checked.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.whole import check_new, new_folder
 
 _TRAINING_STATE = Path("training_state") / "optimizer_state.safetensors"
 _PRETRAINED = "pretrained_model"
@@ -31,6 +31,7 @@ def export_ema(checkpoint: Path, out: Path) -> int:
 
     Raises:
         OptionError: there is no average there, or it is not of that policy.
+        ScenarioError: `out` is not new or empty.
     """
     from safetensors import safe_open
 
@@ -42,24 +43,16 @@ def export_ema(checkpoint: Path, out: Path) -> int:
                 f"{path} is missing: {checkpoint} is not a checkpoint that lerobot-train can resume. Give "
                 "the folder checkpoints/<step> (or checkpoints/last) of the run"
             )
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise OptionError(f"{out} is not an empty folder")
+    check_new(out)
     _check_optimizer(folder)
     policy = _load(model)
     with safe_open(state, framework="pt") as file:
         count = _copy(policy, file, state)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
+    with new_folder(out) as folder:
         shutil.copytree(
-            model, temporary, ignore=shutil.ignore_patterns("model.safetensors", "train_config.json")
+            model, folder, ignore=shutil.ignore_patterns("model.safetensors", "train_config.json")
         )
-        policy.save_pretrained(temporary)
-        if out.exists():
-            out.rmdir()
-        os.replace(temporary, out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        policy.save_pretrained(folder)
     return count
 
 

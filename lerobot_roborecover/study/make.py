@@ -7,7 +7,6 @@ command goes on by itself where it was stopped; so a rerun continues.
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import shutil
 import time
@@ -21,6 +20,7 @@ from lerobot_roborecover.build.chain.config import ChainConfig, read_config
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
+from lerobot_roborecover.whole import new_folder
 
 POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 2, "diffusion_few": 2, "tdmpc": 1}
 """Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
@@ -64,7 +64,10 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
         out: working folder.
         chain: how the scenarios are built (`chain_for`).
     """
-    policy = lambda name: str(out / "policies" / name)  # noqa: E731
+
+    def policy(name: str) -> str:
+        return str(out / "policies" / name)
+
     screening = [str(p.name) for p in chain.screen.policies]
     trials = out / "scenarios" / "screened.trials"
     scenarios = out / "scenarios" / "split"
@@ -198,25 +201,26 @@ def chain_for(out: Path) -> ChainConfig:
 def assemble(out: Path) -> StudyDefinition:
     """Copies what an evaluation needs into `out/data` and writes its definition."""
     data = out / "data"
-    partial_data = out / "data.partial"
-    shutil.rmtree(partial_data, ignore_errors=True)
+    with new_folder(data, replace=True) as folder:
+        _assemble(out, folder)
+    return read_definition(data)
+
+
+def _assemble(out: Path, folder: Path) -> None:
     ignore = shutil.ignore_patterns("train_config.json", "videos", "images", "*.html")
     for name in POLICIES:
-        shutil.copytree(out / "policies" / name, partial_data / "policies" / name, ignore=ignore)
+        shutil.copytree(out / "policies" / name, folder / "policies" / name, ignore=ignore)
     kept = Path("meta") / "roborecover"
-    shutil.copytree(out / "scenarios" / "split" / kept, partial_data / "scenarios" / kept, ignore=ignore)
-    shutil.copytree(out / "correction", partial_data / "correction", ignore=ignore)
-    shutil.copytree(out / "monitor_training" / _CHECKPOINT, partial_data / "monitor", ignore=ignore)
-    for path in (*partial_data.glob("*/config.json"), *partial_data.glob("policies/*/config.json")):
+    shutil.copytree(out / "scenarios" / "split" / kept, folder / "scenarios" / kept, ignore=ignore)
+    shutil.copytree(out / "correction", folder / "correction", ignore=ignore)
+    shutil.copytree(out / "monitor_training" / _CHECKPOINT, folder / "monitor", ignore=ignore)
+    for path in (*folder.glob("*/config.json"), *folder.glob("policies/*/config.json")):
         _forget_place(path)
     study = StudyDefinition(
-        root=partial_data, platform="metaworld", policies=POLICIES, base=BASE, env=_ENV,
+        root=folder, platform="metaworld", policies=POLICIES, base=BASE, env=_ENV,
         interventions=INTERVENTIONS, environment=KERNELS,
     )  # fmt: skip
     write_definition(study)
-    shutil.rmtree(data, ignore_errors=True)
-    os.replace(partial_data, data)
-    return read_definition(data)
 
 
 def _forget_place(path: Path) -> None:

@@ -7,7 +7,6 @@ not who said it.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 from lerobot_roborecover.build.annotate.votes import Vote
 from lerobot_roborecover.datasets.files import read_bytes
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 SCHEMA_VERSION = 1
 MAX_BYTES = 2**26
@@ -53,10 +53,7 @@ class Discussion:
             "round": self.round,
             "candidates": [{"id": name, **about} for name, about in self.candidates.items()],
         }
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
+        write_whole(path, json.dumps(document, indent=1) + "\n")
 
 
 def read_discussion(path: Path) -> Discussion:

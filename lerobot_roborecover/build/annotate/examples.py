@@ -17,6 +17,7 @@ from pathlib import Path
 from lerobot_roborecover.build.annotate.guide import SLUGS, slug
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 EXAMPLES_FOLDER = "examples"
 MAX_EXAMPLE_BYTES = 2**23
@@ -119,9 +120,7 @@ def render(platform: str, folder: Path) -> None:
         hand_off(simulator, scenario, check=False)
         buffer = io.BytesIO()
         Image.fromarray(simulator.render()).save(buffer, "JPEG", quality=88)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, path)
+        write_whole(path, buffer.getvalue())
 
 
 if __name__ == "__main__":

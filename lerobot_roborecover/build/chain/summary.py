@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from lerobot_roborecover.build.chain.commands import Places
 from lerobot_roborecover.build.funnel import FunnelRow, format_funnel, funnel, read_decisions
 from lerobot_roborecover.build.split_dataset import check_splits, format_report
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.whole import write_whole
 
 FUNNEL_FILE = "funnel.md"
 
@@ -35,10 +35,10 @@ def write_summary(places: Places, config: Path, done: Sequence[Mapping[str, Any]
             break
     places.summary.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(config, places.summary / "build.yaml")
-    _write(places.summary / FUNNEL_FILE, markdown(rows))
-    _write(places.summary / "stages.json", json.dumps(list(done), indent=1) + "\n")
+    write_whole(places.summary / FUNNEL_FILE, markdown(rows))
+    write_whole(places.summary / "stages.json", json.dumps(list(done), indent=1) + "\n")
     if places.split.exists():
-        _write(places.summary / "splits.txt", format_report(check_splits(places.split, None)) + "\n")
+        write_whole(places.summary / "splits.txt", format_report(check_splits(places.split, None)) + "\n")
         shutil.copyfile(places.split / FOLDER / "split.json", places.summary / "split.json")
     return format_funnel(rows) if rows else ""
 
@@ -52,9 +52,3 @@ def markdown(rows: Sequence[FunnelRow]) -> str:
         lines.append(f"| {row.stage} | {row.entered} | {row.kept} | {dropped} | {row.undecided} |")
         reasons += [f"| {row.stage} | {n} | {reason.replace('|', '/')} |" for reason, n in row.dropped]
     return "\n".join([*lines, *(reasons if len(reasons) > 3 else [])]) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)

@@ -22,6 +22,7 @@ from lerobot_roborecover.build.rollout import PERTURBED_STEPS, perturb_translati
 from lerobot_roborecover.scenario import Pose, Reset, Scenario, ScenarioError
 from lerobot_roborecover.simulators.base import Simulator
 from lerobot_roborecover.simulators.limits import Workspace, limits_of
+from lerobot_roborecover.whole import new_file
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,7 @@ def write_record(path: Path, record: Record) -> None:
         "reset": {**asdict(replace(record.reset, fixtures={})), "fixtures": fixtures},
         "workspace": None if record.workspace is None else asdict(record.workspace),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
+    with new_file(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(
             file,
             about=np.array(json.dumps(about)),
@@ -90,9 +89,6 @@ def write_record(path: Path, record: Record) -> None:
             perturbation=record.steps.perturbation,
             margin_rad=record.margin_rad,
         )
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def read_record(path: Path) -> Record:

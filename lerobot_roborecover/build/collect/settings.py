@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 from lerobot_roborecover.build.collect.options import CollectOptions
 from lerobot_roborecover.env.run import RunSpec
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 SETTINGS_FILE = "collect.json"
 
@@ -81,9 +81,7 @@ def claim(work: Path, rolled: Mapping[str, Any]) -> None:
                     "--out, or another --work"
                 )
             return
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        temporary.write_text(json.dumps(rolled, indent=2) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
+        write_whole(path, json.dumps(rolled, indent=2) + "\n")
     except (OSError, ValueError) as err:
         if isinstance(err, ScenarioError):
             raise

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,6 +30,7 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.env.slots import SlotPool
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, ScenarioError, Source
+from lerobot_roborecover.whole import new_folder, write_whole
 
 COLLECT_FILE = "collect.json"
 SCHEMA_VERSION = 1
@@ -107,19 +106,12 @@ def write_collection(
             f"none of the {len(kept)} candidates could be filmed, so {out} is not written. The first: "
             f"{lost[0].reason}: {lost[0].detail}"
         )
-    whole = out.with_name(f".{out.name}.{os.getpid()}.joined")
-    shutil.rmtree(whole, ignore_errors=True)
-    try:
+    with new_folder(out) as whole:
         merge_candidates(whole, parts)
         record_decisions(whole, [*dropped, *lost])
         document = {"schema_version": SCHEMA_VERSION, "written_by": {"lerobot_env_roborecover": __version__}}
         text = json.dumps({**document, **about}, indent=2, allow_nan=False)
         (whole / FOLDER / COLLECT_FILE).write_text(text + "\n", encoding="utf-8")
-        if out.exists():
-            out.rmdir()
-        os.replace(whole, out)
-    finally:
-        shutil.rmtree(whole, ignore_errors=True)
     return out
 
 
@@ -236,11 +228,7 @@ def _lost_path(part: Path) -> Path:
 
 
 def _write_lost(part: Path, lost: Mapping[str, tuple[str, str]]) -> None:
-    path = _lost_path(part)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(lost), encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(_lost_path(part), json.dumps(lost))
 
 
 def _read_lost(part: Path) -> dict[str, tuple[str, str]]:

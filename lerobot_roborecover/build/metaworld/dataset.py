@@ -152,21 +152,40 @@ def save_episode(dataset: Any, task: Task, episode: Episode) -> None:
     dataset.save_episode()
 
 
+def save_demonstrations(
+    dataset: Any, simulator: MetaworldSimulator, name: str, count: int, shaken_steps: Callable[[int], int]
+) -> int:
+    """Appends successful demonstrations of a task.
+
+    Args:
+        dataset: of `create_dataset`.
+        simulator: any.
+        name: of the task.
+        count: how many.
+        shaken_steps: leading steps with perturbed actions, by how many demonstrations there are.
+
+    Returns:
+        Rollouts that it took.
+    """
+    task, found, seed = task_named(name), 0, FIRST_SEED
+    while found < count:
+        episode = demonstration(simulator, task, seed, shaken_steps(found))
+        seed += 1
+        if episode is not None:
+            save_episode(dataset, task, episode)
+            found += 1
+    return seed - FIRST_SEED
+
+
 def write_demonstrations(root: Path, task_names: Iterable[str], episodes_per_task: int) -> None:
     """Writes the dataset; `root` must not exist."""
     dataset = create_dataset(root)
     simulator = MetaworldSimulator(obs_type="state")
     for name in task_names:
-        task, kept, seed = task_named(name), 0, FIRST_SEED
-        while kept < episodes_per_task:
-            shaken = 0 if kept % 2 == 0 else 20 + 20 * (kept % 7)
-            episode = demonstration(simulator, task, seed, shaken)
-            seed += 1
-            if episode is None:
-                continue
-            save_episode(dataset, task, episode)
-            kept += 1
-        print(f"{name}: {kept} episodes from {seed - FIRST_SEED} rollouts", flush=True)
+        rollouts = save_demonstrations(
+            dataset, simulator, name, episodes_per_task, lambda k: 0 if k % 2 == 0 else 20 + 20 * (k % 7)
+        )
+        print(f"{name}: {episodes_per_task} episodes from {rollouts} rollouts", flush=True)
     dataset.finalize()
     simulator.close()
 

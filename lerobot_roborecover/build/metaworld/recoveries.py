@@ -20,11 +20,10 @@ import numpy as np
 
 from lerobot_roborecover.build.metaworld.dataset import (
     DEMO_TASKS,
-    FIRST_SEED,
     Episode,
     create_dataset,
-    demonstration,
     record,
+    save_demonstrations,
     save_episode,
 )
 from lerobot_roborecover.build.metaworld.experts import patient_expert, task_named
@@ -76,14 +75,9 @@ def write(root: Path, failures: Path, demonstrations_per_task: int) -> None:
             kept += 1
     print(f"{kept} recoveries from {tried} attempts", flush=True)
     for name in DEMO_TASKS:
-        found, seed = 0, FIRST_SEED
-        while found < demonstrations_per_task:
-            shaken_steps = 0 if found % 2 == 0 else 20 * (found % 7)
-            episode = demonstration(simulator, task_named(name), seed, shaken_steps)
-            seed += 1
-            if episode is not None:
-                save_episode(dataset, task_named(name), episode)
-                found += 1
+        save_demonstrations(
+            dataset, simulator, name, demonstrations_per_task, lambda k: 0 if k % 2 == 0 else 20 * (k % 7)
+        )
     dataset.finalize()
     simulator.close()
 

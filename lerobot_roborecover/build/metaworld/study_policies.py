@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 import shutil
 import subprocess
@@ -26,6 +25,7 @@ from typing import Any
 
 from lerobot_roborecover.build.metaworld.dataset import STUDY_TASKS, write_demonstrations
 from lerobot_roborecover.build.metaworld.initial_success import evaluate, table
+from lerobot_roborecover.whole import new_folder
 
 EPISODES_PER_TASK = 70
 """Every second one is clean, the others are shaken."""
@@ -70,11 +70,8 @@ def make_demonstrations(out: Path) -> None:
     root = out / "demonstrations"
     if root.exists():
         return
-    partial = out / "demonstrations.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    with _timed(out, "demonstrations"):
-        write_demonstrations(partial, STUDY_TASKS, EPISODES_PER_TASK)
-        os.replace(partial, root)
+    with _timed(out, "demonstrations"), new_folder(root) as folder:
+        write_demonstrations(folder, STUDY_TASKS, EPISODES_PER_TASK)
 
 
 def train(name: str, out: Path) -> None:
@@ -92,14 +89,12 @@ def train(name: str, out: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
         program = [sys.executable, "-m", "lerobot_roborecover.build.metaworld.frames_in_memory"]
         subprocess.run([*program, *arguments], check=True)
-    partial = result.with_name(f"{name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(
-        folder / "checkpoints" / "last" / "pretrained_model",
-        partial,
-        ignore=shutil.ignore_patterns("train_config.json"),
-    )
-    os.replace(partial, result)
+    with new_folder(result) as policy:
+        shutil.copytree(
+            folder / "checkpoints" / "last" / "pretrained_model",
+            policy,
+            ignore=shutil.ignore_patterns("train_config.json"),
+        )
 
 
 def main() -> None:

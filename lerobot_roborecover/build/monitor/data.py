@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +25,7 @@ from lerobot_roborecover.build.monitor.frames import Job, replayed
 from lerobot_roborecover.datasets.trajectories import ScenarioLink, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 MANIFEST_FILE = "monitor_data.json"
 SCHEMA_VERSION = 1
@@ -89,9 +89,7 @@ def write_monitor_data(
         written[part] = digests[part]
         manifest = {"schema_version": SCHEMA_VERSION, "counts": counts, "digests": written, **(note or {})}
         manifest["replays_that_end_otherwise"] = _differing(out, written)
-        temporary = out / f".{MANIFEST_FILE}.{os.getpid()}.tmp"
-        temporary.write_text(json.dumps(manifest, indent=1, default=str) + "\n", encoding="utf-8")
-        os.replace(temporary, out / MANIFEST_FILE)
+        write_whole(out / MANIFEST_FILE, json.dumps(manifest, indent=1, default=str) + "\n")
     return counts
 
 

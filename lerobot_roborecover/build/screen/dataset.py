@@ -22,9 +22,10 @@ from lerobot_roborecover.build.screen.screening import (
 )
 from lerobot_roborecover.build.stage_dataset import write_stage
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.datasets.new_folder import check_new
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.whole import check_new
 
 SCREENING_FILE = "screening.json"
 
@@ -126,7 +127,7 @@ def screen_dataset(
     write_stage(
         request.out,
         source if source.is_dir() else None,
-        [_screened(s, request) for s in found if s.decision.verdict == "kept"],
+        [_screened(s, request.run_seed) for s in found if s.decision.verdict == "kept"],
         (s.decision for s in found),
         (SCREENING_FILE, _record(found, request, rows)),
         scenarios.manifest,
@@ -134,8 +135,8 @@ def screen_dataset(
     return Screening(found, rows)
 
 
-def _screened(found: Screened, request: ScreenRequest):
-    note = provenance_of(found, request.rule, request.run_seed)
+def _screened(found: Screened, run_seed: int) -> Scenario:
+    note = provenance_of(found, run_seed)
     return replace(found.scenario, provenance={**found.scenario.provenance, "screening": note})
 
 

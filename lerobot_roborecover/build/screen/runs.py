@@ -27,6 +27,7 @@ from lerobot_roborecover.build.policy_trials import (
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import TrialLog, read_trial_log
 from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.whole import new_file, write_whole
 
 POLICY_FILE = "policy.json"
 RETRIED_FILE = "retried.jsonl"
@@ -227,10 +228,7 @@ def claim_folder(policy: PolicySpec, folder: Path, env: Sequence[str] = ()) -> N
                     "policy another name (--policy NAME=PATH), or name another --trials-folder"
                 )
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps(document, indent=1) + "\n")
 
 
 def take_trials(source: Path, target: Path) -> int:
@@ -270,11 +268,8 @@ def take_trials(source: Path, target: Path) -> int:
             if before is not None:
                 continue
             if row.steps:
-                (target / ACTIONS_FOLDER).mkdir(exist_ok=True)
-                copy = actions_path(target / ACTIONS_FOLDER, row)
-                temporary = copy.with_suffix(f".{os.getpid()}.tmp")
-                shutil.copyfile(actions_path(source / ACTIONS_FOLDER, row), temporary)
-                os.replace(temporary, copy)
+                with new_file(actions_path(target / ACTIONS_FOLDER, row)) as copy:
+                    shutil.copyfile(actions_path(source / ACTIONS_FOLDER, row), copy)
             log.append(row)
             new += 1
     finally:
@@ -306,10 +301,5 @@ def forget_trials(folder: Path, outcomes: Sequence[str]) -> int:
             file.writelines(json.dumps(asdict(r)) + "\n" for r in gone)
             file.flush()
             os.fsync(file.fileno())
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        with open(temporary, "w", encoding="utf-8") as file:
-            file.writelines(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        write_whole(path, "".join(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept))
     return len(gone)

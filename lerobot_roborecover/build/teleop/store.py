@@ -9,7 +9,6 @@ from __future__ import annotations
 import fcntl
 import io
 import json
-import os
 import re
 import zipfile
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.scenario import Pose, Reset, ScenarioError, Task
+from lerobot_roborecover.whole import new_file
 
 SCHEMA_VERSION = 1
 MAX_RECORDING_BYTES = 2**28
@@ -91,21 +91,10 @@ class Store:
             ScenarioError: it could not be written; nothing of it is there.
         """
         path = self.folder / f"recording-{number:06d}.npz"
-        temporary = self.folder / f".{path.name}.tmp"
         try:
-            with open(temporary, "wb") as file:
+            with new_file(path) as temporary, open(temporary, "wb") as file:
                 _write(file, recorded)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-            # The name is only there after a crash once its folder is on disk, too.
-            folder = os.open(self.folder, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
         except OSError as err:
-            temporary.unlink(missing_ok=True)
             raise ScenarioError(f"{path} could not be written: {err}. Make room on the disk") from err
         return path
 

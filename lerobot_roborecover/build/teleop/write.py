@@ -7,7 +7,6 @@ at once.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -25,6 +24,7 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, ScenarioError, Source
 from lerobot_roborecover.simulators import Simulator, make_simulator
+from lerobot_roborecover.whole import new_folder
 
 PER_PART = 10
 """Recordings of a part: so many are rendered again, at most, after an interruption."""
@@ -194,14 +194,5 @@ def _frames(recorded: Recorded, simulator: Simulator, film_every: int) -> Iterat
 
 
 def _join(dataset: Path, parts: list[Path]) -> None:
-    fresh = dataset.with_name(f".{dataset.name}.{os.getpid()}.joined")
-    old = dataset.with_name(f".{dataset.name}.{os.getpid()}.old")
-    shutil.rmtree(fresh, ignore_errors=True)
-    try:
-        merge_candidates(fresh, parts)
-        if dataset.exists():
-            os.replace(dataset, old)
-        os.replace(fresh, dataset)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+    with new_folder(dataset, replace=True) as folder:
+        merge_candidates(folder, parts)

@@ -7,8 +7,6 @@ their page, and what people decided on looking at them (`rejects.jsonl`). A reru
 from __future__ import annotations
 
 import importlib.util
-import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,11 +28,11 @@ from lerobot_roborecover.build.validate.validation import (
     judge,
     replays_from,
 )
-from lerobot_roborecover.datasets.new_folder import check_new
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import check_new, new_folder
 
 VALIDATION_FILE = "validation.json"
 REPLAYS_FILE, REJECTS_FILE, PAGE_FILE = "replays.jsonl", "rejects.jsonl", "index.html"
@@ -157,20 +155,8 @@ def _write(
     record: Mapping[str, Any],
     manifest: Mapping[str, Any],
 ) -> None:
-    """Writes the dataset beside its place, and then puts it there."""
-    temporary = request.out.with_name(f".{request.out.name}.{os.getpid()}.new")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        write_stage(temporary, request.dataset, kept, decisions, (VALIDATION_FILE, record), manifest)
-        if request.out.exists():
-            old = request.out.with_name(f".{request.out.name}.{os.getpid()}.old")
-            os.replace(request.out, old)
-            os.replace(temporary, request.out)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, request.out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(request.out, replace=True) as folder:
+        write_stage(folder, request.dataset, kept, decisions, (VALIDATION_FILE, record), manifest)
 
 
 def _people(request: ValidationRequest, ids: set[str]) -> dict[str, dict[str, Any]]:

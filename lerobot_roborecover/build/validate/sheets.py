@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from lerobot_roborecover.build.funnel import Decision
 from lerobot_roborecover.build.validate.validation import Replays, ValidationRule
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.whole import new_file, write_whole
 
 AMPLIFIED = 4
 """What differences are multiplied with, to be seen."""
@@ -57,10 +57,8 @@ def draw_sheet(
         draw.text((2, top + 1), label, fill="black")
         sheet.paste(band, (0, top + _STRIP))
         top += band.height + _STRIP
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    sheet.save(temporary, "PNG")
-    os.replace(temporary, path)
+    with new_file(path) as temporary:
+        sheet.save(temporary, "PNG")
 
 
 def write_page(
@@ -96,9 +94,7 @@ def write_page(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True
     ).get_template("page.html.j2")
     text = template.render(entries=entries, rule=rule, command=command)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
 
 
 def _badness(replays: Replays, decision: Decision, scenario_id: str) -> tuple:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import new_file
 
 HOST = "127.0.0.1"
 MAX_SOCKET_MESSAGE_BYTES = 2**16
@@ -66,12 +67,10 @@ def kept_tokens(kind: str, folder: Path, names: Sequence[str]) -> dict[str, str]
     for name in names:
         if len(known.get(name, "")) < 20:
             known[name] = secrets.token_urlsafe(24)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(
-        os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
-    ) as file:
-        json.dump(known, file)
-    os.replace(temporary, path)
+    with new_file(path) as temporary:
+        private = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with open(private, "w", encoding="utf-8") as file:
+            json.dump(known, file)
     return {name: known[name] for name in names}
 
 

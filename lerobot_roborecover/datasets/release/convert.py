@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from lerobot_roborecover.datasets.new_folder import new_folder
 from lerobot_roborecover.datasets.release.record import KEY, RULES, Sources, to_json, to_scenario
 from lerobot_roborecover.datasets.release.tables import (
     MAX_RECORD_BYTES,
@@ -31,6 +30,7 @@ from lerobot_roborecover.datasets.release.tables import (
 )
 from lerobot_roborecover.datasets.schema import check_limits
 from lerobot_roborecover.scenario import Scenario, ScenarioError, Source
+from lerobot_roborecover.whole import new_folder
 
 
 @dataclass(frozen=True)
