@@ -269,7 +269,7 @@ def test_trials_of_a_donor_go_on_after_a_kill(tmp_path):
         "import sys; from pathlib import Path\n"
         "from lerobot_roborecover.build.policy_trials import env_config, run_trials\n"
         "env = env_config('fake', sys.argv[2])\n"
-        "run_trials(sys.argv[1], env, Path(sys.argv[3]), trials=20, device='cpu', max_batch=1)"
+        "run_trials(sys.argv[1], env, Path(sys.argv[3]), trials=8, device='cpu', max_batch=1)"
     )
 
     def start(folder: Path) -> subprocess.Popen:
@@ -284,12 +284,12 @@ def test_trials_of_a_donor_go_on_after_a_kill(tmp_path):
     killed.kill()
     killed.wait()
     before = len(read_trials(tmp_path / "killed"))
-    assert before < 120
+    assert before < 48
     for folder in ("killed", "whole"):
         assert start(tmp_path / folder).wait() == 0
     told = [
         {(t.row.scenario_id, t.row.trial): (t.row.outcome, t.row.steps, t.actions.tobytes()) for t in found}
         for found in (read_trials(tmp_path / "killed"), read_trials(tmp_path / "whole"))
     ]
-    assert len(read_trials(tmp_path / "killed")) == len(told[0]) == 120
+    assert len(read_trials(tmp_path / "killed")) == len(told[0]) == 48
     assert told[0] == told[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from multiprocessing.connection import wait
 
@@ -30,7 +31,7 @@ def dies(say):
 def stays(say):
     try:  # from the first line on: who hears it may interrupt at once
         say(str(os.getpid()))
-        time.sleep(300)
+        time.sleep(60)
     except KeyboardInterrupt:
         say("finishes")
         raise
@@ -73,8 +74,14 @@ def test_what_says_nothing_in_time_is_an_error_and_is_ended():
     assert not runs(pid)
 
 
-def test_an_interrupted_one_finishes_as_after_ctrl_c():
-    with Speaker("the server", stays) as speaker:
+@pytest.mark.parametrize("here", [signal.default_int_handler, signal.SIG_IGN], ids=["front", "background"])
+def test_an_interrupted_one_finishes_as_after_ctrl_c(here):
+    before = signal.signal(signal.SIGINT, here)
+    try:
+        speaker = Speaker("the server", stays)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with speaker:
         assert speaker.hear()
         speaker.interrupt()
         assert speaker.hear() == "finishes"

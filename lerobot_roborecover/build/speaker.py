@@ -84,6 +84,8 @@ class Speaker:
 
 def _work(parent: int, said: Connection, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     end_with_parent(parent)
+    # A shell has its background jobs ignore Ctrl-C, and their children inherit it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         work(*arguments, lambda line: said.send((False, line)))
     except ScenarioError as err:

@@ -101,7 +101,7 @@ class Engine:
         Returns:
             Number of trials finished.
         """
-        self._queue = UnitQueue(u for u in units if not self._done(u))
+        self._queue = UnitQueue(unfinished(self._run, units))
         self._finished = 0
         while not stop():
             self._fill()
@@ -327,12 +327,6 @@ class Engine:
         seat.slot.send(command, argument)
         seat.state = "working"
 
-    def _done(self, unit: Unit) -> bool:
-        key = trial_key(
-            unit.scenario.sha256(), unit.scenario.id, self._run.protocol.config_hash(), unit.trial
-        )
-        return self._run.log is not None and self._run.log.find(key) is not None
-
     def _lost(self, seat: Seat, reason: str) -> None:
         """The trial's machine is gone: it is run again from its start, elsewhere."""
         key = (seat.unit.scenario.id, seat.unit.trial)
@@ -389,6 +383,15 @@ class Engine:
             self._run.log.append(row)
         self._finished += 1
         self._on_row(row)
+
+
+def unfinished(run: Run, units: Sequence[Unit]) -> list[Unit]:
+    """Units that the run's trial log does not hold yet."""
+    if run.log is None:
+        return list(units)
+    hash_ = run.protocol.config_hash()
+    keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
+    return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
 
 
 def units_of(scenarios: Sequence[Scenario], trials: int) -> list[Unit]:

@@ -31,7 +31,7 @@ from lerobot_roborecover.env.render_device import egl_devices, render_environmen
 from lerobot_roborecover.env.run import group_name, open_run
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.env.vector_env import Run
-from lerobot_roborecover.evaluate.engine import Engine, units_of
+from lerobot_roborecover.evaluate.engine import Engine, unfinished, units_of
 from lerobot_roborecover.evaluate.host import Host
 from lerobot_roborecover.evaluate.load_problems import load_remedy, other_action_width
 from lerobot_roborecover.evaluate.local import LocalEngine
@@ -39,7 +39,7 @@ from lerobot_roborecover.evaluate.policy_host import PolicyHost
 from lerobot_roborecover.evaluate.progress import ProgressLine, Tally
 from lerobot_roborecover.evaluate.sizes import available_gb, default_slots, usable_cores
 from lerobot_roborecover.evaluate.smoke import check_smoke
-from lerobot_roborecover.evaluate.units import Unit, UnitQueue
+from lerobot_roborecover.evaluate.units import Unit, UnitQueue, first_units
 from lerobot_roborecover.evaluate.videos import VideoKeeper
 
 logger = logging.getLogger(__name__)
@@ -197,7 +197,8 @@ def _rows(run: Run) -> list[TrialRow]:
 
 
 def _local_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
-    """Starts the simulators, tries a picture while the policy loads, and puts both together."""
+    """Starts the simulators, has each make its first task and a picture while the policy loads, and puts both
+    together."""
     renders = cfg.env.obs_type != "state" or cfg.runner.videos
     if renders:
         devices = egl_devices()
@@ -206,9 +207,13 @@ def _local_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options:
     usual = default_slots(str(cfg.policy.device), usable_cores(), available_gb())
     count = min(cfg.runner.slots or usual, len(units))
     slots = run.pool.slots(count)
-    slots[0].send(*(("smoke", UnitQueue(units).take(None).scenario) if renders else ("fingerprint",)))
+    begun = list(zip(slots, first_units(unfinished(run, units), count), strict=False))
+    for slot, unit in begun:
+        slot.send(*(("smoke", unit.scenario) if renders else ("fingerprint",)))
     host = load_host(cfg)
-    check_smoke(slots[0].receive())
+    # Where no simulator can be made the run is refused; where only some break, it is their trials' affair.
+    replies = [slot.receive() for slot, _ in begun]
+    check_smoke(replies[0])
     return LocalEngine(run, host, slots=count, **options)
 
 

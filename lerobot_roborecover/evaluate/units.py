@@ -23,6 +23,15 @@ class Unit:
         return self.scenario.task.suite, self.scenario.task.name
 
 
+def first_units(units: Iterable[Unit], slots: int) -> list[Unit]:
+    """What so many idle slots take first, in their order; fewer where there are not as many units."""
+    queue = UnitQueue(units)
+    taken: list[Unit] = []
+    while len(taken) < slots and (unit := queue.take(None, [u.task for u in taken])) is not None:
+        taken.append(unit)
+    return taken
+
+
 class UnitQueue:
     """Hands out units so that a slot meets the same scenario, then the same task, again.
 
