@@ -22,7 +22,7 @@ from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.evaluate.engine import units_of
 from lerobot_roborecover.evaluate.host import PolicyError
 from lerobot_roborecover.evaluate.local import LocalEngine
-from lerobot_roborecover.evaluate.units import Unit, UnitQueue
+from lerobot_roborecover.evaluate.units import Unit, UnitQueue, first_units
 
 TRIALS = 3
 
@@ -178,6 +178,15 @@ def test_slots_spread_over_tasks():
     first = queue.take(None)
     second = queue.take(None, busy=[first.task])
     assert first.task != second.task
+
+
+@pytest.mark.parametrize("slots", [1, 2, 3, 20])
+def test_idle_slots_begin_with_tasks_of_their_own_while_there_are(slots):
+    units = [unit(t, n, k) for t in ("push-left", "push-right") for n in "ab" for k in range(3)]
+    taken = first_units(units, slots)
+    assert len({(u.scenario.id, u.trial) for u in taken}) == len(taken) == min(slots, len(units))
+    assert len({u.task for u in taken[:2]}) == min(slots, 2)
+    assert first_units([], slots) == []
 
 
 def test_dropping_a_scenario_takes_its_units_out():
