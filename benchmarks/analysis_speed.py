@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
 def main() -> None:
@@ -23,12 +23,11 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=200)
     parser.add_argument("--trials", type=int, default=5)
     args = parser.parse_args()
-    from trial_rows import policy_rows, write_log
-
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.report import write_report
     from lerobot_roborecover.analysis.report_tables import all_tables
     from lerobot_roborecover.analysis.results import analyse
+    from tests.support.trial_rows import policy_rows, write_log
 
     with tempfile.TemporaryDirectory() as folder:
         root, logs = Path(folder), []

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 _MEASURE = """async ([key, shift, presses]) => {
   const times = [];
@@ -52,8 +52,8 @@ def texture(side: int):
 
 def main() -> None:
     """Measures and prints."""
-    from browser import browsing
-    from candidate_files import candidate_dataset
+    from tests.support.browser import browsing
+    from tests.support.candidate_files import candidate_dataset
 
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -93,6 +93,7 @@ def measure(visit, address: str, args: argparse.Namespace) -> None:
     began = time.perf_counter()
     page, _ = visit(address)
     page.wait_for_selector("#cameras canvas[data-step='0']")
+    page.keyboard.press("g")  # closes the guide that a first visit opens
     print(f"{args.episodes} episodes of {args.steps} frames, two cameras of {args.side} x {args.side}")
     print(f"page opened, first frame shown: {time.perf_counter() - began:.2f} s")
     _line("single frames while the episode still loads", page.evaluate(_MEASURE, ["ArrowRight", False, 60]))

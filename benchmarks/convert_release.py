@@ -57,8 +57,8 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=2000)
     parser.add_argument("--steps", type=int, default=200, help="prefix length of every record")
     args = parser.parse_args()
-    sys.path.insert(0, str(ROOT / "tests"))
-    from release_files import libero_record, write_release
+    sys.path.insert(0, str(ROOT))
+    from tests.support.release_files import libero_record, write_release
 
     with tempfile.TemporaryDirectory() as folder:
         release, out = Path(folder) / "release", Path(folder) / "out"

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.command_line import RunFacts
-from lerobot_roborecover.env.episode import EpisodeSpec, SlotConfig, SlotFailure
+from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import RecoveryOptions
-from lerobot_roborecover.env.run import RunSpec, open_run
-from lerobot_roborecover.env.slots import WorkerSlot
-from lerobot_roborecover.evaluate.engine import units_of
-from lerobot_roborecover.evaluate.local import LocalEngine
+from lerobot_roborecover.env.run import PlatformPart, open_run
 from lerobot_roborecover.scenario import Reset, Scenario, Task
+from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.slots import WorkerSlot
 
 
 class StubHost:
@@ -90,7 +90,7 @@ def run_engine(
             scenarios=str(root), trial_log=f"{folder}/log.jsonl", strict_versions=False, handoff_check=False
         )
         loaded, run = open_run(
-            options, RunSpec(slot, {}, None), workers=True, facts=RunFacts("stub", n_episodes=trials)
+            options, PlatformPart(slot, {}, None), workers=True, facts=RunFacts("stub", n_episodes=trials)
         )
         run.protocol = replace(run.protocol, run_seed=0)
         run.pool.acquire()

@@ -36,15 +36,16 @@ from engine_parts import (
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.command_line import RunFacts
-from lerobot_roborecover.env.episode import EpisodeSpec, SlotConfig, SlotFailure
+from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import RecoveryOptions
-from lerobot_roborecover.env.run import RunSpec, open_run
-from lerobot_roborecover.env.slots import WorkerSlot
-from lerobot_roborecover.evaluate.engine import units_of
-from lerobot_roborecover.evaluate.local import LocalEngine
-from lerobot_roborecover.replay import SnapshotCache, hand_off
-from lerobot_roborecover.simulators import make_simulator
+from lerobot_roborecover.env.run import PlatformPart, open_run
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.snapshots import SnapshotCache
+from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.slots import WorkerSlot
 
 STEP_S = 0.011
 """A simulator's step in `overlap`: LIBERO's, without a picture."""
@@ -206,7 +207,7 @@ def startup_one(args: argparse.Namespace) -> dict:
         root = write_scenarios(Path(folder) / "set", scenarios)
         options = RecoveryOptions(scenarios=str(root), trial_log=f"{folder}/log.jsonl", strict_versions=False)
         loaded, run = open_run(
-            options, RunSpec(config, {}, None), workers=True, facts=RunFacts("stub", n_episodes=1)
+            options, PlatformPart(config, {}, None), workers=True, facts=RunFacts("stub", n_episodes=1)
         )
         host = StubHost(7)
         run.pool.acquire()

@@ -14,9 +14,9 @@ import statistics
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from test_schedule import schedule
+from tests.trials.test_schedule import schedule
 
 
 def main() -> None:

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.env.episode import EpisodeSpec, EpisodeStart, SlotConfig
-from lerobot_roborecover.env.slots import WorkerSlot
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.workers.messages import EpisodeSpec, EpisodeStart, SlotConfig
+from lerobot_roborecover.workers.slots import WorkerSlot
 
 PREFIX_STEPS = 150
 
@@ -33,7 +33,7 @@ class Plain:
     """A stock LeRobot LIBERO env per scenario; the prefix goes through its `step`."""
 
     def __init__(self, size: int):
-        from lerobot_roborecover.simulators.libero_assets import find_assets, quiet_import
+        from lerobot_roborecover.platforms.libero.assets import find_assets, quiet_import
 
         quiet_import(find_assets())  # LIBERO would ask where to keep data sets
         from lerobot.envs.libero import LiberoEnv, _get_suite
@@ -146,7 +146,7 @@ def handoffs(scenarios: list[Scenario], size: int, later: int) -> dict:
 
 def bare_step_ms(scenario: Scenario) -> float:
     """Milliseconds of a step that renders nothing."""
-    from lerobot_roborecover.simulators import make_simulator
+    from lerobot_roborecover.platforms import make_simulator
 
     simulator = make_simulator("libero", obs_type="state")
     simulator.reset(scenario.task, scenario.reset)

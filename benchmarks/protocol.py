@@ -15,10 +15,11 @@ import time
 from collections.abc import Iterable
 
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.replay import SnapshotCache, hand_off
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.simulators import make_simulator
-from lerobot_roborecover.simulators.base import Simulator
+from lerobot_roborecover.snapshots import SnapshotCache
 
 
 def measure(simulator: Simulator, scenario: Scenario, cache: SnapshotCache, steps: int) -> dict[str, float]:

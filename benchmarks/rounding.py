@@ -20,9 +20,9 @@ from lerobot_roborecover.rounding import CORE_TYPE, VARIABLE
 def one(name: str, every: int) -> dict:
     """Replays the set's scenarios in this process."""
     from lerobot_roborecover import load_scenarios
+    from lerobot_roborecover.platforms import make_simulator
     from lerobot_roborecover.replay import hand_off
     from lerobot_roborecover.rounding import core_type_in_use
-    from lerobot_roborecover.simulators import make_simulator
 
     scenarios = list(load_scenarios(name))[::every]
     simulator = make_simulator(scenarios[0].platform, obs_type="state")

@@ -14,17 +14,18 @@ import argparse
 
 import numpy as np
 
-from lerobot_roborecover.build.metaworld.experts import expert, task_named
-from lerobot_roborecover.build.validate.frames import TAIL, Encoder, encoded, ssim, window
+from lerobot_roborecover.curation.validate.frames import TAIL, Encoder, encoded, ssim, window
 from lerobot_roborecover.datasets.frames import KEPT
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.platforms.metaworld import PLATFORM
+from lerobot_roborecover.platforms.metaworld.experts import expert
 from lerobot_roborecover.scenario import Reset
-from lerobot_roborecover.simulators import make_simulator
 
 
 def rollout(task_name: str, size: int, steps: int) -> list[np.ndarray]:
     """(H, W, 3) frames of one rollout, one a step."""
     simulator = make_simulator("metaworld", observation_height=size, observation_width=size)
-    simulator.reset(task_named(task_name), Reset(seed=0))
+    simulator.reset(PLATFORM.task(task_name), Reset(seed=0))
     act = expert(simulator, task_name)
     frames = []
     for t in range(steps):

@@ -19,11 +19,13 @@ import numpy as np
 
 from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
+from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
-from lerobot_roborecover.scenario import PLATFORM_ACTION_DIMS, ScenarioError, Task
-from lerobot_roborecover.simulators import SimulatorError
+from lerobot_roborecover.datasets.video_frames import check_frames
+from lerobot_roborecover.platforms import SimulatorError, platform_named
+from lerobot_roborecover.scenario import ScenarioError, Task
 from lerobot_roborecover.whole import check_new, new_folder
 
 
@@ -37,7 +39,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--driver", required=True, help="the policy that drove")
     add("--task", help="the task's name, where the recorded instruction does not tell it")
     add("--suite", default="", help="where several suites have the task")
-    add("--license", help="SPDX identifier of the data; none is assumed")
+    add(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the data; none is assumed",
+    )
     args = parser.parse_args(argv)
     try:
         rows = convert(args)
@@ -58,6 +64,7 @@ def convert(args: argparse.Namespace) -> list[TrajectoryRow]:
         raise ScenarioError(
             f"{args.dataset} has no meta/info.json; name the folder of a LeRobotDataset (v3.0)"
         )
+    check_frames(args.dataset, thorough=True)
     source = LeRobotDataset("roborecover/source", root=args.dataset)
     rows, actions = read_rows(source, args)
     added = {
@@ -83,10 +90,10 @@ def read_rows(source: Any, args: argparse.Namespace) -> tuple[list[TrajectoryRow
             f"{args.dataset} has a column {EXACT_ACTION} already: it is a dataset of this package"
         )
     width = features["action"]["shape"][0] if "action" in features else None
-    if width not in PLATFORM_ACTION_DIMS[args.platform]:
+    if width not in platform_named(args.platform).action_widths:
         raise ScenarioError(
             f"{args.dataset}: actions have width {width}; {args.platform} takes "
-            f"{' or '.join(map(str, PLATFORM_ACTION_DIMS[args.platform]))}"
+            f"{' or '.join(map(str, platform_named(args.platform).action_widths))}"
         )
     names = ["action", "episode_index", "task_index", *(n for n in ("next.success",) if n in features)]
     table = source.hf_dataset.with_format("arrow").select_columns(names)[:]

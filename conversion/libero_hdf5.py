@@ -18,10 +18,11 @@ import numpy as np
 from lerobot_roborecover.datasets.converted import write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
 from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array
+from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.task_lookup import task_by_name
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
+from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.scenario import ScenarioError, Task
-from lerobot_roborecover.simulators.libero_init_states import read_init_states
 
 CAMERAS = (("agentview_rgb", "agentview_image"), ("eye_in_hand_rgb", "robot0_eye_in_hand_image"))
 """By LeRobot's `image` and `image2`: LIBERO's own names and robomimic's."""
@@ -34,7 +35,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="new folder of the dataset")
     parser.add_argument("--suite", default="", help="where several suites have a task of the name")
     parser.add_argument("--driver", default="human", help="who drove (%(default)s)")
-    parser.add_argument("--license", help="SPDX identifier of the data; none is assumed")
+    parser.add_argument(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the data; none is assumed",
+    )
     args = parser.parse_args(argv)
     return write_converted(
         "libero_hdf5",
@@ -70,7 +75,8 @@ def trajectory(demo: Any, name: str, path: Path, task: Task, states: np.ndarray,
     # The env pauses while a person reads the scene; a file without a single pause had them taken out.
     if not (np.abs(actions[:, :6]).max(axis=1) < 1e-6).any():
         reasons.append("no action is a no-op: they were probably taken out")
-    first = read_array(demo, "states", ndim=2)[0] if "states" in demo else None
+    rows = (len(actions), "actions")
+    first = read_array(demo, "states", ndim=2, rows=rows)[0] if "states" in demo else None
     index = None
     if first is not None and first.shape == states[0].shape:
         # The first number is the simulator's clock.
@@ -78,7 +84,7 @@ def trajectory(demo: Any, name: str, path: Path, task: Task, states: np.ndarray,
         index = int(match[0]) if len(match) else None
     if index is None:
         reasons.append("the first state is none of the task's stored init states")
-    rewards = read_array(demo, "rewards", ndim=1) if "rewards" in demo else np.zeros(1)
+    rewards = read_array(demo, "rewards", ndim=1, rows=rows) if "rewards" in demo else np.zeros(1)
     return Trajectory(
         task=task,
         driver=driver,
@@ -93,20 +99,24 @@ def trajectory(demo: Any, name: str, path: Path, task: Task, states: np.ndarray,
 def frames(obs: Any, steps: int) -> Iterator[Frame]:
     """Observations under the names and in the form that policies of LeRobot's LIBERO env see."""
     pictures = {}
+    rows = (steps, "actions")
     for key, names in zip(("image", "image2"), CAMERAS, strict=True):
         name = next((n for n in names if n in obs), None)
         if name is not None:
-            pictures[key] = read_array(obs, name, ndim=4, width=3)
+            pictures[key] = read_array(obs, name, ndim=4, width=3, rows=rows)
     if "ee_states" in obs:
-        pose, gripper = read_array(obs, "ee_states", width=6), read_array(obs, "gripper_states", width=2)
+        pose, gripper = (
+            read_array(obs, "ee_states", ndim=2, width=6, rows=rows),
+            read_array(obs, "gripper_states", ndim=2, width=2, rows=rows),
+        )
         state = np.concatenate([pose, gripper], axis=1).astype(np.float32)
     else:
         state = None
         position, quat = (
-            read_array(obs, "robot0_eef_pos", width=3),
-            read_array(obs, "robot0_eef_quat", width=4),
+            read_array(obs, "robot0_eef_pos", ndim=2, width=3, rows=rows),
+            read_array(obs, "robot0_eef_quat", ndim=2, width=4, rows=rows),
         )
-        gripper = read_array(obs, "robot0_gripper_qpos", width=2)
+        gripper = read_array(obs, "robot0_gripper_qpos", ndim=2, width=2, rows=rows)
     for i in range(steps):
         robot = {
             "eef": {"pos": np.zeros(3), "quat": np.array([0.0, 0.0, 0.0, 1.0]), "mat": np.eye(3)},

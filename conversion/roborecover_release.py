@@ -1,6 +1,8 @@
 """Converts the paper's own release (scenario JSON files and split tables) to scenario datasets, and back.
 
     python conversion/roborecover_release.py RELEASE --out DIR             # DIR/libero, DIR/robotwin
+    python conversion/roborecover_release.py ARCHIVE --splits CLONE/splits --out DIR
+    python conversion/roborecover_release.py EXAMPLE.json --out DIR        # without a split table
     python conversion/roborecover_release.py RELEASE --out DIR --render    # also replay and render
     python conversion/roborecover_release.py DIR/libero DIR/robotwin --export --out RELEASE2
 
@@ -15,29 +17,39 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
-from lerobot_roborecover.datasets.release.convert import (
-    Conversion,
-    Problem,
-    export_release,
-    platforms_of,
-    read_release,
-    read_sources,
-)
+from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.datasets.release.convert import Conversion, Problem, platforms_of, read_release
+from lerobot_roborecover.datasets.release.earlier import compare_with_earlier, read_converted, read_earlier
+from lerobot_roborecover.datasets.release.export import export_release
 from lerobot_roborecover.datasets.release.initial_state import check_initial_state
-from lerobot_roborecover.datasets.release.record import RULES
+from lerobot_roborecover.datasets.release.lone import read_files
+from lerobot_roborecover.datasets.release.record import Reading
+from lerobot_roborecover.datasets.release.robot import check_robot, initial_state_of
+from lerobot_roborecover.datasets.release.sources import Sources, read_sources
+from lerobot_roborecover.datasets.release.tables import PLATFORMS
 from lerobot_roborecover.datasets.render import check_rendering, render_dataset
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.platforms import SimulatorError
+from lerobot_roborecover.platforms.libero.assets import find_assets
+from lerobot_roborecover.platforms.robotwin.checkout import RobotwinCheckout
+from lerobot_roborecover.platforms.robotwin.render import QUALITIES
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.simulators import SimulatorError
-from lerobot_roborecover.simulators.robotwin_checkout import RobotwinCheckout
-from lerobot_roborecover.simulators.robotwin_render import QUALITIES
-from lerobot_roborecover.whole import check_new
+from lerobot_roborecover.whole import check_new, write_whole
+from lerobot_roborecover.workers.jobs import JobPool
+
+_OWN_OPTIONS = {
+    "--env.robotwin_root=<folder>": "--robotwin-root FOLDER",
+    "--env.assets_dir": "--assets-dir",
+    "--env.render_quality=trivial": "--render-quality trivial",
+    "use --env.obs_type=state, which renders nothing": "--fingerprint alone, which renders nothing",
+}
+"""What messages of the simulators call an option of the evaluators, and what it is called here."""
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -47,15 +59,27 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add(
         "source",
         nargs="+",
-        help="the release's folder; with --export, converted datasets (folders or Hub ids)",
+        help="the release's folder, or JSON files of it; with --export, or to replay it again, converted "
+        "datasets (folders or Hub ids)",
     )
     add("--out", type=Path, required=True, help="folder to write to")
-    add("--platform", choices=("libero", "robotwin"), help="convert this platform only")
+    add("--splits", type=Path, help="folder of the split tables, where they lie apart from the data")
+    add("--platform", choices=PLATFORMS, help="convert this platform only")
     add("--sources", type=Path, help="CSV (name,source,source_policy): exceptions to the rules of sources")
     add("--keep-extra", action="store_true", help="keep unknown fields instead of refusing their records")
-    add("--license", help="SPDX identifier of the data, for the manifest; none is assumed")
+    add("--any-seed", action="store_true", help="take LIBERO records of other seeds than the release's 7")
+    add(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the data, for the manifest; none is assumed",
+    )
     add("--fingerprint", action="store_true", help="replay each prefix: exact reset and handoff fingerprint")
-    add("--render", action="store_true", help="--fingerprint, and the prefixes' observations as episodes")
+    add(
+        "--last-frames",
+        action="store_true",
+        help="--fingerprint, and the last five frames before each handoff",
+    )
+    add("--render", action="store_true", help="--last-frames, and the prefixes' observations as episodes")
     add("--size", type=int, default=256, help="LIBERO's picture side in pixels (%(default)s, as released)")
     add("--workers", type=int, default=os.cpu_count() or 1, help="processes that replay (%(default)s)")
     add("--assets-dir", help="LIBERO's assets, where they are not found by themselves")
@@ -66,12 +90,15 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Converts or exports; 0 done, 1 done but some records failed, 2 refused."""
+    """Converts or exports; 0 done, 1 done but some records failed, 2 refused: nothing was converted."""
     args = parse(argv)
     try:
         return export(args) if args.export else convert(args)
     except (ScenarioError, SimulatorError) as err:
-        print(f"roborecover_release: {err}", file=sys.stderr)
+        text = str(err)
+        for theirs, ours in _OWN_OPTIONS.items():
+            text = text.replace(theirs, ours)
+        print(f"roborecover_release: {text}", file=sys.stderr)
         return 2
 
 
@@ -88,111 +115,200 @@ def export(args: argparse.Namespace) -> int:
 
 
 def convert(args: argparse.Namespace) -> int:
-    """Converts every platform of the release that is asked for."""
-    if len(args.source) > 1:
-        raise ScenarioError(f"{len(args.source)} sources; give the one folder that holds splits/")
-    root = Path(args.source[0])
-    sources = read_sources(args.sources) if args.sources else RULES
-    platforms = [args.platform] if args.platform else platforms_of(root)
-    if not platforms:
+    """Converts every platform that is asked for."""
+    results = read(args)
+    if args.fingerprint or args.last_frames or args.render:
+        # Refused before hours of replay, not after.
+        check_simulators(args, {r.platform for r in results if r.scenarios})
+    for result in results:
+        if result.platform == "robotwin":
+            refuse_other_robots(result, args.robotwin_root)
+    counts = [write(args, result) for result in results]
+    return 2 if not any(counts) else int(any(result.failures for result in results))
+
+
+def read(args: argparse.Namespace) -> list[Conversion]:
+    """The records of every platform that is asked for: of a release, single ones, or converted before."""
+    reading = Reading(
+        read_sources(args.sources) if args.sources else Sources(), args.keep_extra, args.any_seed
+    )
+    paths = [Path(source) for source in args.source]
+    if all(path.is_file() for path in paths):
+        results = read_files(paths, reading)
+    elif all((path / FOLDER).is_dir() for path in paths):
+        if not (args.fingerprint or args.last_frames or args.render):
+            raise ScenarioError(
+                f"{paths[0]} is converted already; say --fingerprint, --last-frames or --render to replay it "
+                "again, or --export to write the release's files back"
+            )
+        results = [read_converted(path, reading) for path in paths]
+    elif len(paths) > 1:
         raise ScenarioError(
-            f"{root} has no splits/libero_*.csv or splits/robotwin_*.csv; name the release's folder"
+            f"{len(paths)} sources; give the one folder that holds libero/ and robotwin/, and the folder of "
+            "split tables with --splits where they lie apart; or JSON files alone"
         )
-    if "robotwin" in platforms and (args.render or args.fingerprint):
-        # Refused before LIBERO's hours of replay, not after.
-        RobotwinCheckout(args.robotwin_root)
-    status = 0
-    for platform in platforms:
-        result = read_release(root, platform, sources=sources, keep_extra=args.keep_extra)
-        status |= write(args, result)
-    return status
+    else:
+        platforms = [args.platform] if args.platform else platforms_of(paths[0], args.splits)
+        if not platforms:
+            raise ScenarioError(
+                f"{args.splits or paths[0]} has no splits/libero_*.csv or splits/robotwin_*.csv; name the "
+                "release's folder, and with --splits that of the tables (in the git clone) where it is "
+                "another. JSON files are converted without a table when they are named themselves"
+            )
+        results = [read_release(paths[0], p, tables=args.splits, reading=reading) for p in platforms]
+    chosen = [r for r in results if args.platform in (None, r.platform)]
+    if not chosen:
+        raise ScenarioError(f"none of the records is of {args.platform}, as --platform asks")
+    return chosen
+
+
+def check_simulators(args: argparse.Namespace, platforms: Collection[str]) -> None:
+    """Checks that what replays is on this machine."""
+    if "robotwin" in platforms:
+        try:
+            RobotwinCheckout(args.robotwin_root)
+        except SimulatorError as err:
+            raise SimulatorError(f"{err}; or convert LIBERO alone, with --platform libero") from None
+    if "libero" in platforms:
+        find_assets(args.assets_dir)
+
+
+def refuse_other_robots(result: Conversion, robotwin_root: str | None) -> None:
+    """Refuses the records that another robot than the checkout's made, where there is a checkout; replays
+    nothing."""
+    try:
+        robot = RobotwinCheckout(robotwin_root).robot
+    except SimulatorError:
+        return  # whoever replays the set brings a robot, and every handoff compares it
+    for scenario in list(result.scenarios):
+        try:
+            check_robot(robot, initial_state_of(scenario))
+        except ScenarioError as err:
+            path = scenario.provenance["release"]["split_row"]["path"]
+            result.failures.append(Problem(path, None, scenario.id, str(err)))
+            result.scenarios.remove(scenario)
 
 
 def write(args: argparse.Namespace, result: Conversion) -> int:
-    """Writes one platform's dataset and reports what failed."""
+    """Writes one platform's dataset, reports what failed, and returns the number of scenarios."""
     out, work = args.out / result.platform, args.out / f".{result.platform}.work"
-    replay = args.render or args.fingerprint
-    if args.render:
+    pictures = args.render or args.last_frames
+    if pictures:
         check_new(out)
-    looking = {**_options(args, result.platform), "obs_type": "pixels_agent_pos"}
-    if args.render and result.scenarios:
-        check_rendering(result.scenarios, looking)
-    scenarios: list[Scenario] = result.scenarios
-    deviations: dict[str, dict[str, float]] = {}
-    refused = len(result.failures)
-    if replay:
-        scenarios = []
-        for done in fingerprint_scenarios(
-            result.scenarios,
-            work / "fingerprints.jsonl",
-            options={**_options(args, result.platform), "obs_type": "state"},
-            check=check_initial_state,
-            workers=args.workers,
-            progress=lambda n, total: _progress(f"{result.platform}: replayed", n, total),
-        ):
-            path = done.scenario.provenance["release"]["split_row"]["path"]
-            if done.error:
-                result.failures.append(Problem(path, None, done.scenario.id, done.error))
-                continue
-            scenarios.append(done.scenario)
-            deviations[done.scenario.id] = dict(done.deviations)
+    earlier = read_earlier(out, args.fingerprint)
     said = {"description": "The paper's release, converted.", "license": args.license}
-    if scenarios and replay and args.render:
-        render_dataset(
-            out,
-            scenarios,
-            work,
-            options=looking,
-            workers=args.workers,
-            progress=lambda n, total: _progress(f"{result.platform}: rendered shards", n, total),
-            **said,
-        )
-    elif scenarios:
-        write_scenarios(out, scenarios, **said)
-    if replay and (args.render or len(result.failures) == refused):
-        shutil.rmtree(work)
-    _report(result, scenarios, deviations, out, replay)
-    return int(bool(result.failures))
+    deviations: dict[str, dict[str, float]] | None = None
+    scenarios = result.scenarios
+    if not (pictures or args.fingerprint) or not scenarios:
+        if scenarios:
+            write_scenarios(out, scenarios, **said)
+        _report(result, scenarios, deviations, out)
+        return len(scenarios)
+    refused = len(result.failures)
+    with JobPool(result.platform, _options(args, result.platform), args.workers) as pool:
+        if pictures:
+            check_rendering(scenarios, pool)
+        scenarios, deviations = replay(result, work, pool)
+        result.warnings.extend(compare_with_earlier(out, earlier, scenarios))
+        if scenarios and pictures:
+            render_dataset(
+                out,
+                scenarios,
+                work,
+                pool=pool,
+                episodes=args.render,
+                progress=lambda n, total: _progress(f"{result.platform}: rendered shards", n, total),
+                **said,
+            )
+        elif scenarios:
+            write_scenarios(out, scenarios, **said)
+    if pictures or len(result.failures) == refused:
+        shutil.rmtree(work, ignore_errors=True)
+    _report(result, scenarios, deviations, out)
+    return len(scenarios)
+
+
+def replay(
+    result: Conversion, work: Path, pool: JobPool
+) -> tuple[list[Scenario], dict[str, dict[str, float]]]:
+    """Replays every scenario; what cannot be is added to the failures.
+
+    Returns:
+        Those with their exact reset and fingerprint, and by id how far the first state was from the record's.
+    """
+    scenarios: list[Scenario] = []
+    deviations: dict[str, dict[str, float]] = {}
+    for done in fingerprint_scenarios(
+        result.scenarios,
+        work / "fingerprints.jsonl",
+        check=check_initial_state,
+        pool=pool,
+        progress=lambda n, total: _progress(f"{result.platform}: replayed", n, total),
+    ):
+        path = done.scenario.provenance["release"]["split_row"]["path"]
+        if done.error:
+            result.failures.append(Problem(path, None, done.scenario.id, done.error))
+            continue
+        scenarios.append(done.scenario)
+        deviations[done.scenario.id] = dict(done.deviations)
+    return scenarios, deviations
 
 
 def _options(args: argparse.Namespace, platform: str) -> dict[str, Any]:
     """Options of the platform's simulator; RoboTwin's own configuration says how large its pictures are."""
+    obs_type = "pixels_agent_pos" if args.render or args.last_frames else "state"
     if platform == "robotwin":
-        return {"robotwin_root": args.robotwin_root, "render_quality": args.render_quality}
-    size = {"observation_height": args.size, "observation_width": args.size}
-    return {"assets_dir": args.assets_dir, **size}
+        return {
+            "robotwin_root": args.robotwin_root,
+            "render_quality": args.render_quality,
+            "obs_type": obs_type,
+        }
+    return {
+        "assets_dir": args.assets_dir,
+        "observation_height": args.size,
+        "observation_width": args.size,
+        "obs_type": obs_type,
+    }
 
 
 def _report(
     result: Conversion,
     scenarios: Sequence[Scenario],
-    deviations: dict[str, dict[str, float]],
+    deviations: dict[str, dict[str, float]] | None,
     out: Path,
-    replayed: bool,
 ) -> None:
-    """Says what became of the records, and leaves the same in the dataset."""
+    """Says what became of the records, and leaves the same in the dataset; `deviations` where they were
+    replayed."""
     worst: dict[str, float] = {}
-    for found in deviations.values():
+    for found in (deviations or {}).values():
         worst = {name: max(value, worst.get(name, 0.0)) for name, value in found.items()}
     for problem in (*result.failures, *result.warnings):
         print(problem, file=sys.stderr)
+    if not scenarios:
+        why = (
+            f"all of its {len(result.failures)} records were refused" if result.failures else "it has no rows"
+        )
+        print(f"roborecover_release: {result.platform}: nothing was converted, {why}", file=sys.stderr)
+        return
     off = ", ".join(f"{name} {value:.2g}" for name, value in worst.items())
     state = "fingerprinted" + (f" (initial states off by at most {off})" if off else "")
     print(
-        f"{out if scenarios else result.platform}: {len(scenarios)} scenarios converted, "
-        f"{len(result.failures)} refused; "
-        + (state if replayed else "usable for evaluation, not fingerprinted: the handoff is not checked")
+        f"{out}: {len(scenarios)} scenarios converted, {len(result.failures)} refused; "
+        + (
+            state
+            if deviations is not None
+            else "usable for evaluation, not fingerprinted: the handoff is not checked"
+        )
     )
-    if scenarios:
-        report = {
-            "scenarios": len(scenarios),
-            "fingerprinted": replayed,
-            "initial_state_largest_deviation": worst,
-            "initial_state_deviations": deviations,
-            "refused": [vars(p) for p in result.failures],
-            "warnings": [vars(p) for p in result.warnings],
-        }
-        (out / FOLDER / "conversion.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    report = {
+        "scenarios": len(scenarios),
+        "fingerprinted": deviations is not None,
+        "initial_state_largest_deviation": worst,
+        "initial_state_deviations": deviations or {},
+        "refused": [vars(p) for p in result.failures],
+        "warnings": [vars(p) for p in result.warnings],
+    }
+    write_whole(out / FOLDER / "conversion.json", json.dumps(report, indent=2) + "\n")
 
 
 def _progress(what: str, done: int, total: int) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets.converted import write_converted
 from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array
+from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.release.tables import read_file
 from lerobot_roborecover.datasets.task_lookup import task_by_name
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
@@ -43,7 +44,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--fps", type=int, default=25, help="frame rate, as LeRobot's env has it (%(default)s)"
     )
-    parser.add_argument("--license", help="SPDX identifier of the data; none is assumed")
+    parser.add_argument(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the data; none is assumed",
+    )
     args = parser.parse_args(argv)
     return write_converted(
         "robotwin_hdf5",
@@ -107,7 +112,9 @@ def instruction(folder: Path, number: int, kind: str) -> str:
 def frames(file: Any, joints: np.ndarray) -> Iterator[Frame]:
     """Observations under the names of LeRobot's RoboTwin env; the last state has no action, and no frame."""
     pictures = {
-        c: read_array(file, f"observation/{c}/rgb", ndim=1) for c in CAMERAS if c in file["observation"]
+        c: read_array(file, f"observation/{c}/rgb", ndim=1, rows=(len(joints), "joint states"))
+        for c in CAMERAS
+        if c in file["observation"]
     }
     for i in range(len(joints) - 1):
         yield {

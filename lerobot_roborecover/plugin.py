@@ -7,16 +7,11 @@ from pathlib import Path
 from types import TracebackType
 
 from lerobot_roborecover.env import configs  # noqa: F401 - registers the env types
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_log import TrialLogError
+from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.interventions import configuration_intervention, ema  # noqa: F401 - register types
 from lerobot_roborecover.interventions.monitor import register_monitors
+from lerobot_roborecover.platforms.base import ENV_PREFIX
 from lerobot_roborecover.remote import configuration_remote  # noqa: F401 - registers the policy
-from lerobot_roborecover.remote.errors import RemoteError
-from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.simulators import SimulatorError
-
-ENV_PREFIX = "roborecover_"
 
 register_monitors()
 
@@ -53,7 +48,7 @@ def rewrite_env_argument(argv: list[str]) -> list[str]:
 
 def plain_errors(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """`sys.excepthook` that shows a refusal of ours as its message alone: the traceback would bury it."""
-    if issubclass(kind, (OptionError, RemoteError, ScenarioError, SimulatorError, TrialLogError)):
+    if issubclass(kind, RoboRecoverError):
         print(f"error: {error}", file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)

@@ -2,6 +2,7 @@
 
 The order that makes it exact and fast (paper, "Recovery Scenario and Evaluation"):
 
+0. the simulator's robot must be the one that recorded (`platforms.robot_fingerprint`), or nothing holds;
 1. put the task in its exact first state;
 2. replay all but the last action of the prefix, rendering nothing;
 3. where snapshots are exact, take one here, so that a later trial can start from it;
@@ -11,25 +12,25 @@ The order that makes it exact and fast (paper, "Recovery Scenario and Evaluation
 
 from __future__ import annotations
 
-import hashlib
-import os
-import tempfile
 import time
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+from lerobot_roborecover.platforms.robot_fingerprint import NAME, compare_robots
+from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
+from lerobot_roborecover.platforms.walk import advance
 from lerobot_roborecover.scenario import (
     HANDOFF_TOLERANCE_M,
     Fingerprint,
     Outcome,
     Pose,
+    Rollout,
     Scenario,
     ScenarioError,
     Start,
+    TrialStart,
 )
-from lerobot_roborecover.simulators.base import Simulator, SimulatorError
+from lerobot_roborecover.snapshots import SnapshotCache, snapshot_key
 
 
 @dataclass(frozen=True)
@@ -57,82 +58,9 @@ class Handoff:
     """The problem in words."""
 
 
-class SnapshotCache:
-    """Handoff snapshots by key, the least recently used dropped; optionally kept on disk as well.
-
-    Args:
-        max_bytes: memory the snapshots may take.
-        folder: where to keep them between runs; None keeps them in memory alone.
-        approximate: serve simulators whose snapshots are not exact as well: the state comes back, what
-            follows drifts from a replay. Nobody gets this without asking for it.
-    """
-
-    def __init__(self, max_bytes: int = 64 * 2**20, folder: Path | None = None, *, approximate: bool = False):
-        self.approximate = approximate
-        self._max_bytes = max_bytes
-        self._folder = folder
-        self._entries: OrderedDict[str, tuple[bytes, str]] = OrderedDict()
-        self._bytes = 0
-        self.rejected: set[str] = set()
-        """Keys whose restored state once differed from a replay's: never used again."""
-
-    def get(self, key: str) -> tuple[bytes, str] | None:
-        """The snapshot and the state hash that one step after it must give, or None."""
-        if key in self.rejected:
-            return None
-        if key in self._entries:
-            self._entries.move_to_end(key)
-            return self._entries[key]
-        if self._folder is not None:
-            try:
-                raw = (self._folder / f"{key}.snapshot").read_bytes()
-            except OSError:
-                return None
-            digest, body = raw[:32], raw[32:]
-            if hashlib.sha256(body).digest() != digest:
-                return None
-            entry = (body[64:], body[:64].decode())
-            self._remember(key, entry)
-            return entry
-        return None
-
-    def put(self, key: str, snapshot: bytes, state_sha256: str) -> None:
-        """Keeps a snapshot together with the state hash it leads to."""
-        self._remember(key, (snapshot, state_sha256))
-        if self._folder is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            body = state_sha256.encode() + snapshot
-            with tempfile.NamedTemporaryFile(dir=self._folder, delete=False) as file:
-                file.write(hashlib.sha256(body).digest() + body)
-            os.replace(file.name, self._folder / f"{key}.snapshot")
-
-    def reject(self, key: str) -> None:
-        """Drops a snapshot that did not lead to the replayed state, for good."""
-        self.rejected.add(key)
-        entry = self._entries.pop(key, None)
-        if entry:
-            self._bytes -= len(entry[0])
-        if self._folder is not None:
-            (self._folder / f"{key}.snapshot").unlink(missing_ok=True)
-
-    def _remember(self, key: str, entry: tuple[bytes, str]) -> None:
-        if key in self._entries:
-            self._bytes -= len(self._entries.pop(key)[0])
-        self._entries[key] = entry
-        self._bytes += len(entry[0])
-        while self._bytes > self._max_bytes and len(self._entries) > 1:
-            self._bytes -= len(self._entries.popitem(last=False)[1][0])
-
-
-def snapshot_key(scenario: Scenario, step: int, versions: Mapping[str, str]) -> str:
-    """Cache key of a handoff: scenario content, handoff step, and the versions that decide the physics."""
-    text = f"{scenario.sha256()} {step} {sorted(versions.items())}"
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def hand_off(
     simulator: Simulator,
-    scenario: Scenario,
+    scenario: TrialStart,
     start: Start = Start.RECOVERY,
     *,
     rewind_steps: int = 0,
@@ -150,11 +78,14 @@ def hand_off(
         cache: snapshots of earlier handoffs, used where the simulator's are exact.
 
     Raises:
-        SimulatorError: the simulator cannot be reset or stepped.
+        SimulatorError: the simulator cannot be reset or stepped, or has another robot than the one that
+            recorded, which is never a `state_mismatch`.
     """
     began = time.perf_counter()
+    if check and scenario.fingerprint is not None:
+        check_robot(simulator, scenario)
     step = scenario.handoff_step(start, rewind_steps)
-    state, from_snapshot = replay_to(simulator, scenario, step, cache)
+    state, from_snapshot = replay_to(simulator, scenario.rollout, step, cache)
     handoff = Handoff(step, 0.0, from_snapshot, state, None, None, None, None)
     if check and scenario.fingerprint is not None and step == scenario.fingerprint.step:
         handoff = _compare(handoff, simulator.bodies(), scenario.fingerprint)
@@ -167,14 +98,31 @@ def hand_off(
     return replace(handoff, seconds=time.perf_counter() - began)
 
 
+def check_robot(simulator: Simulator, scenario: TrialStart) -> None:
+    """Checks that the simulator has the robot that recorded a scenario, as far as its fingerprint says.
+
+    Raises:
+        SimulatorError: another one; the message says in what it differs, worst first.
+    """
+    here = simulator.fingerprint()
+    robots = compare_robots(scenario.fingerprint.versions, here)
+    if robots.another:
+        raise SimulatorError(
+            f"the robot {here.get(NAME, '')} here is another than the one that recorded scenario "
+            f"{scenario.id}: {robots}. Nothing recorded there replays here: put the platform's own robot in "
+            f"place (roborecover doctor --platform {scenario.platform} says how), or use scenarios that were "
+            "recorded on this one"
+        )
+
+
 def replay_to(
-    simulator: Simulator, scenario: Scenario, step: int, cache: SnapshotCache | None = None
+    simulator: Simulator, rollout: Rollout, step: int, cache: SnapshotCache | None = None
 ) -> tuple[str, bool]:
-    """Resets the task and replays the first `step` actions of its prefix, or restores what that gave before.
+    """Resets the task and replays the first `step` actions, or restores what that gave before.
 
     Args:
         simulator: left after the last of them, ready for `observe`.
-        scenario: what to replay.
+        rollout: what to replay.
         step: number of actions.
         cache: snapshots of earlier replays, used where the simulator's are exact, or the cache approximate.
 
@@ -182,51 +130,50 @@ def replay_to(
         Hash of the simulator's state, and whether a snapshot stood in for the replay.
     """
     if cache is not None and cache.approximate and not simulator.snapshot_is_exact and step > 0:
-        return _restore_to(simulator, scenario, step, cache), True
-    use_cache = cache is not None and simulator.snapshot_is_exact and step > 0
-    key = snapshot_key(scenario, step, simulator.fingerprint()) if use_cache else ""
-    cached = cache.get(key) if use_cache else None
-    simulator.reset(scenario.task, scenario.reset)
-    if cached is not None:
+        return _restore_to(simulator, rollout, step, cache), True
+    if not simulator.snapshot_is_exact or step == 0:
+        cache = None
+    key = "" if cache is None else snapshot_key(rollout, step, simulator.fingerprint())
+    cached = None if cache is None else cache.get(key)
+    simulator.reset(rollout.task, rollout.reset)
+    if cache is not None and cached is not None:
         snapshot, expected = cached
         simulator.restore(snapshot)
-        simulator.step(scenario.prefix[step - 1])
+        simulator.step(rollout.actions[step - 1])
         state = simulator.state_sha256()
         if state == expected:
             return state, True
         cache.reject(key)
-        simulator.reset(scenario.task, scenario.reset)
-    for action in scenario.prefix[: max(step - 1, 0)]:
-        simulator.step(action)
-    snapshot = simulator.snapshot() if use_cache and key not in cache.rejected else None
+        simulator.reset(rollout.task, rollout.reset)
+    advance(simulator, rollout.actions[: max(step - 1, 0)])
+    snapshot = simulator.snapshot() if cache is not None and key not in cache.rejected else None
     if step:
-        simulator.step(scenario.prefix[step - 1])
+        simulator.step(rollout.actions[step - 1])
     state = simulator.state_sha256()
-    if snapshot is not None:
+    if cache is not None and snapshot is not None:
         cache.put(key, snapshot, state)
     return state, False
 
 
-def _restore_to(simulator: Simulator, scenario: Scenario, step: int, cache: SnapshotCache) -> str:
+def _restore_to(simulator: Simulator, rollout: Rollout, step: int, cache: SnapshotCache) -> str:
     """What `replay_to` does where snapshots give the state back but not its exact continuation.
 
     Every trial goes on from the restored snapshot, also the one that took it: what follows is then the same
     for all of them, whichever came first.
     """
-    simulator.reset(scenario.task, scenario.reset)
-    key = snapshot_key(scenario, step, simulator.fingerprint())
+    simulator.reset(rollout.task, rollout.reset)
+    key = snapshot_key(rollout, step, simulator.fingerprint())
     cached = cache.get(key)
     if cached is None:
-        for action in scenario.prefix[:step]:
-            simulator.step(action)
+        advance(simulator, rollout.actions[:step])
         cached = simulator.snapshot(), simulator.state_sha256()
         cache.put(key, *cached)
-        simulator.reset(scenario.task, scenario.reset)
+        simulator.reset(rollout.task, rollout.reset)
     snapshot, state = cached
     simulator.restore(snapshot)
     if simulator.state_sha256() != state:
         raise SimulatorError(
-            f"scenario {scenario.id}: the cached snapshot of step {step} does not restore the state that it "
+            f"{rollout.task.name}: the cached snapshot of step {step} does not restore the state that it "
             "was taken of. Delete the folder of --env.snapshot_dir, or go without "
             "--env.approximate_snapshots"
         )

@@ -10,11 +10,26 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 
 VARIABLE = "OPENBLAS_CORETYPE"
 CORE_TYPE = "Haswell"
 """AVX2 and FMA: every x86-64 processor since 2015 has them."""
+
+KERNELS: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_CBWR": "COMPATIBLE",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+}
+"""torch's kernels, its own, MKL's and oneDNN's, chosen alike on every x86-64 processor with AVX2, so that
+policies round alike. They are read when torch is loaded: given to a process, not set in one."""
+
+
+def policy_kernels() -> dict[str, str]:
+    """`KERNELS`, or no more than one thread on a processor that lacks them."""
+    return dict(KERNELS) if has_kernels() else {"OMP_NUM_THREADS": KERNELS["OMP_NUM_THREADS"]}
 
 
 def pin_rounding() -> None:

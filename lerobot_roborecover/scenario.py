@@ -1,4 +1,5 @@
-"""The records of a recovery benchmark: task, reset, scenario, fingerprint, and what a trial can end as.
+"""The records of a recovery benchmark: task, reset, rollout, scenario, fingerprint, and what a trial can
+end as.
 
 Pure: numpy and the standard library only, so that simulator workers can import it in milliseconds.
 A recovery scenario is R = (T, a_<t, m, z, d) of the paper's problem formulation: task, action prefix,
@@ -13,33 +14,44 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-PLATFORM_ACTION_DIMS: dict[str, tuple[int, ...]] = {
-    "libero": (7,),
-    "metaworld": (4,),
-    "robotwin": (14, 16),
-    "fake": (2,),
-}
-"""Action widths each platform accepts."""
+from lerobot_roborecover.errors import RoboRecoverError
 
 HANDOFF_TOLERANCE_M = 0.002
 """Largest end-effector or object displacement of a faithful handoff (paper, "Replay-Based Data Checking")."""
 
-_LONG_HORIZON = 500
-"""S from which RoboTwin's Reversion goes back twice as far."""
-
 MAX_PREFIX_STEPS = 20_000
 MAX_ACTION_MAGNITUDE = 1e3
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+MAX_ID_CHARS = 200
+"""Of an id. File systems bear names of 255 bytes, and an id becomes a part of some: the longest are films,
+`<id>_trial<number>_solved_by_prefix.mp4`, with 37 bytes beside the id at ten digits, and LeRobot's own folder
+of videos, `<group>_<id>`. The paper's release has ids of up to 146 characters."""
+ID_RULE = f"1 to {MAX_ID_CHARS} letters, digits, '.', '_' or '-' starting with a letter or digit"
+"""What `is_id` asks for, in words."""
+_ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_ID_CHARS - 1}}}")
+_SPLIT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_PLATFORM = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._,'()-]{0,255}")
 
 
-class ScenarioError(ValueError):
+class ScenarioError(RoboRecoverError, ValueError):
     """A scenario, or a file that holds one, is not usable; the message says which field, the value and the
     limit."""
+
+
+def is_id(value: object) -> bool:
+    """Whether a value can be the id of a scenario, a candidate or a sample: `ID_RULE`."""
+    return isinstance(value, str) and _ID.fullmatch(value) is not None
+
+
+def shown_id(value: object) -> str:
+    """What was given as an id, for a message: cut where it is long, and then with its length."""
+    text = str(value)
+    return repr(text) if len(text) <= 80 else f"{text[:80]!r}... ({len(text)} characters)"
 
 
 class Stage(StrEnum):
@@ -123,7 +135,7 @@ class Task:
     """T of the paper: what is to be done, and in how many steps."""
 
     platform: str
-    """`libero`, `metaworld`, `robotwin` or `fake`."""
+    """Name of a registered platform, e.g. `libero`; `platforms.platform_named` finds it."""
     suite: str
     """The platform's own group of tasks, e.g. `libero_goal`."""
     name: str
@@ -134,8 +146,11 @@ class Task:
     """S: new environment steps a trial may take."""
 
     def __post_init__(self):
-        if self.platform not in PLATFORM_ACTION_DIMS:
-            raise ScenarioError(f"platform {self.platform!r} is not one of {sorted(PLATFORM_ACTION_DIMS)}")
+        if not isinstance(self.platform, str) or not _PLATFORM.fullmatch(self.platform):
+            raise ScenarioError(
+                f"platform {str(self.platform)[:80]!r} is not a plain name: 1 to 40 lower-case letters, "
+                "digits or '_', a letter first"
+            )
         for label in ("suite", "name"):
             value = getattr(self, label)
             if not isinstance(value, str) or not _NAME.fullmatch(value) or ".." in value:
@@ -204,93 +219,129 @@ class Fingerprint:
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """One recovery scenario: the fixed unit of evaluation."""
+class Rollout:
+    """A task, its exact first state, and the actions executed from there: all that decides a state."""
+
+    task: Task
+    reset: Reset
+    actions: np.ndarray
+    """(T, A) float64: as executed from the reset on, unclipped and unpadded."""
+
+    def __post_init__(self):
+        actions = np.asarray(self.actions)
+        if actions.dtype != np.float64 or actions.ndim != 2:
+            raise ScenarioError(
+                f"prefix must be a (steps, action width) float64 array, got shape {actions.shape} of "
+                f"{actions.dtype}"
+            )
+        steps = len(actions)
+        if steps > MAX_PREFIX_STEPS:
+            raise ScenarioError(f"prefix has {steps} actions; the limit is {MAX_PREFIX_STEPS}")
+        bad = np.argwhere(~np.isfinite(actions))
+        if len(bad):
+            raise ScenarioError(
+                f"prefix action {bad[0][0]}, dimension {bad[0][1]} is {actions[tuple(bad[0])]}; "
+                "actions must be finite. Record the rollout again: a gap cannot be replayed"
+            )
+        if steps and np.abs(actions).max() > MAX_ACTION_MAGNITUDE:
+            raise ScenarioError(
+                f"prefix holds |action| {np.abs(actions).max():.3g}; the limit is {MAX_ACTION_MAGNITUDE:g}"
+            )
+        if self.reset.settle_steps > steps:
+            raise ScenarioError(
+                f"settle_steps {self.reset.settle_steps} exceeds the prefix of {steps} actions"
+            )
+        actions = np.ascontiguousarray(actions)
+        actions.setflags(write=False)
+        object.__setattr__(self, "actions", actions)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @property
+    def platform(self) -> str:
+        """The task's platform."""
+        return self.task.platform
+
+    def sha256(self) -> str:
+        """Hash of everything that decides the state after the last action: task, reset and actions."""
+        return self._sha256
+
+    @cached_property
+    def _sha256(self) -> str:
+        t, r = self.task, self.reset
+        head = [
+            t.platform,
+            t.suite,
+            t.name,
+            t.instruction,
+            t.horizon,
+            r.seed,
+            r.init_state_index,
+            r.settle_steps,
+        ]
+        fixtures = [[n, *p.position_m, *p.quat_xyzw] for n, p in sorted(r.fixtures.items())]
+        digest = hashlib.sha256(json.dumps([head, fixtures, list(self.actions.shape)]).encode())
+        digest.update(self.actions.astype("<f8").tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Labels:
+    """A scenario's labels as text; all empty for a rollout that has none."""
+
+    stage: str = ""
+    deviation: str = ""
+    source: str = ""
+    source_policy: str = ""
+    cluster: str = ""
+    split: str = ""
+
+
+@dataclass(frozen=True)
+class TrialStart:
+    """What a trial starts from: a rollout under a name, after which somebody takes over.
+
+    It needs no labels: a scenario has them, the first state of a task has none.
+    """
 
     id: str
     """Unique in its dataset; safe as a file name, a task id and a directory name."""
     task: Task
     reset: Reset
     prefix: np.ndarray
-    """(t, A) float64: the recorded actions from the reset to the recovery point, unclipped and unpadded."""
-    stage: Stage
-    deviation: DeviationType
-    source: Source
-    source_policy: str = ""
-    """Who drove: the policy's name; for a perturbed rollout, the policy under the perturbation."""
-    split: str = "test"
-    cluster: str = ""
-    """Scenarios of one source trajectory share it; the resampling unit where trajectories yield several."""
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    """JSON-able notes on how the scenario was made: annotation votes, proof of recoverability, and the
-    like."""
-    fingerprint: Fingerprint | None = None
+    """(t, A) float64: the recorded actions from the reset to where the trial starts, unclipped and
+    unpadded."""
+    fingerprint: Fingerprint | None = field(default=None, kw_only=True)
+    """The state after the prefix as it was recorded; None where there is nothing to compare with."""
+    rollout: Rollout = field(init=False, repr=False, compare=False)
+    """Task, reset and prefix: what is replayed."""
 
     def __post_init__(self):
-        if not isinstance(self.id, str) or not _ID.fullmatch(self.id):
-            raise ScenarioError(
-                f"scenario id {str(self.id)[:80]!r} is not 1 to 128 letters, digits, '.', '_' or '-' "
-                "starting with a letter or digit"
-            )
-        object.__setattr__(self, "stage", _member(Stage, self.stage, self.id, "stage"))
-        object.__setattr__(
-            self, "deviation", _member(DeviationType, self.deviation, self.id, "deviation type")
-        )
-        object.__setattr__(self, "source", _member(Source, self.source, self.id, "source"))
-        if not isinstance(self.split, str) or not _ID.fullmatch(self.split):
-            raise ScenarioError(f"scenario {self.id}: split {str(self.split)[:80]!r} is not a plain name")
-        prefix = np.asarray(self.prefix)
-        if prefix.dtype != np.float64 or prefix.ndim != 2:
-            raise ScenarioError(
-                f"scenario {self.id}: prefix must be a (steps, action width) float64 array, "
-                f"got shape {prefix.shape} of {prefix.dtype}"
-            )
-        steps, width = prefix.shape
-        if steps > MAX_PREFIX_STEPS:
-            raise ScenarioError(
-                f"scenario {self.id}: prefix has {steps} actions; the limit is {MAX_PREFIX_STEPS}"
-            )
-        if width not in PLATFORM_ACTION_DIMS[self.task.platform]:
-            raise ScenarioError(
-                f"scenario {self.id}: prefix actions have width {width}; platform {self.task.platform} takes "
-                f"{' or '.join(map(str, PLATFORM_ACTION_DIMS[self.task.platform]))}"
-            )
-        bad = np.argwhere(~np.isfinite(prefix))
-        if len(bad):
-            raise ScenarioError(
-                f"scenario {self.id}: prefix action {bad[0][0]}, dimension {bad[0][1]} is "
-                f"{prefix[tuple(bad[0])]}; "
-                "actions must be finite. Record the rollout again: a gap cannot be replayed"
-            )
-        if steps and np.abs(prefix).max() > MAX_ACTION_MAGNITUDE:
-            raise ScenarioError(
-                f"scenario {self.id}: prefix holds |action| {np.abs(prefix).max():.3g}; the limit is "
-                f"{MAX_ACTION_MAGNITUDE:g}"
-            )
-        if self.reset.settle_steps > steps:
-            raise ScenarioError(
-                f"scenario {self.id}: settle_steps {self.reset.settle_steps} exceeds the prefix of "
-                f"{steps} actions"
-            )
+        if not is_id(self.id):
+            raise ScenarioError(f"scenario id {shown_id(self.id)} is not {ID_RULE}")
+        try:
+            rollout = Rollout(self.task, self.reset, self.prefix)
+        except ScenarioError as err:
+            raise ScenarioError(f"scenario {self.id}: {err}") from None
+        steps = len(rollout)
         if self.fingerprint is not None and self.fingerprint.step != steps:
             raise ScenarioError(
                 f"scenario {self.id}: fingerprint is of step {self.fingerprint.step}, the prefix "
                 f"has {steps} actions"
             )
-        prefix = np.ascontiguousarray(prefix)
-        prefix.setflags(write=False)
-        object.__setattr__(self, "prefix", prefix)
-        object.__setattr__(self, "provenance", dict(self.provenance))
-
-    @property
-    def cell(self) -> str:
-        """Stage × deviation type, e.g. `Approach-Wrong Pose`."""
-        return f"{self.stage.value}-{self.deviation.value}"
+        object.__setattr__(self, "rollout", rollout)
+        object.__setattr__(self, "prefix", rollout.actions)
 
     @property
     def platform(self) -> str:
         """The task's platform."""
         return self.task.platform
+
+    @property
+    def labels(self) -> Labels:
+        """What is known of it beside the rollout."""
+        return Labels()
 
     def handoff_step(self, start: Start, rewind_steps: int = 0) -> int:
         """Number of prefix actions to replay before the policy takes over.
@@ -308,33 +359,52 @@ class Scenario:
     def sha256(self) -> str:
         """Hash of everything that decides the recovery state: task, reset and prefix (not labels or
         split)."""
-        t, r = self.task, self.reset
-        head = [
-            t.platform,
-            t.suite,
-            t.name,
-            t.instruction,
-            t.horizon,
-            r.seed,
-            r.init_state_index,
-            r.settle_steps,
-        ]
-        fixtures = [[n, *p.position_m, *p.quat_xyzw] for n, p in sorted(r.fixtures.items())]
-        digest = hashlib.sha256(json.dumps([head, fixtures, list(self.prefix.shape)]).encode())
-        digest.update(self.prefix.astype("<f8").tobytes())
-        return digest.hexdigest()
+        return self.rollout.sha256()
 
 
-def default_rewind_steps(platform: str, horizon: int) -> int:
-    """Steps that Reversion goes back where nobody says otherwise; the caller stops at the start.
+@dataclass(frozen=True)
+class Scenario(TrialStart):
+    """One recovery scenario, the fixed unit of evaluation: a rollout up to its recovery point, and labels."""
 
-    30, and on RoboTwin 60 from a horizon of 500 (paper, "Intervention Results" and "Reversion Results").
+    stage: Stage
+    deviation: DeviationType
+    source: Source
+    source_policy: str = ""
+    """Who drove: the policy's name; for a perturbed rollout, the policy under the perturbation."""
+    split: str = "test"
+    cluster: str = ""
+    """Scenarios of one source trajectory share it; the resampling unit where trajectories yield several."""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    """JSON-able notes on how the scenario was made: annotation votes, proof of recoverability, and the
+    like."""
 
-    Args:
-        platform: of the task.
-        horizon: S of the task.
-    """
-    return 60 if platform == "robotwin" and horizon >= _LONG_HORIZON else 30
+    def __post_init__(self):
+        super().__post_init__()
+        object.__setattr__(self, "stage", _member(Stage, self.stage, self.id, "stage"))
+        object.__setattr__(
+            self, "deviation", _member(DeviationType, self.deviation, self.id, "deviation type")
+        )
+        object.__setattr__(self, "source", _member(Source, self.source, self.id, "source"))
+        if not isinstance(self.split, str) or not _SPLIT.fullmatch(self.split):
+            raise ScenarioError(f"scenario {self.id}: split {str(self.split)[:80]!r} is not a plain name")
+        object.__setattr__(self, "provenance", dict(self.provenance))
+
+    @property
+    def cell(self) -> str:
+        """Stage × deviation type, e.g. `Approach-Wrong Pose`."""
+        return f"{self.stage.value}-{self.deviation.value}"
+
+    @property
+    def labels(self) -> Labels:
+        """Its labels as a trial's row has them."""
+        return Labels(
+            self.stage.value,
+            self.deviation.value,
+            self.source.value,
+            self.source_policy,
+            self.cluster,
+            self.split,
+        )
 
 
 def _member[E: StrEnum](enum: type[E], value: object, scenario_id: str, label: str) -> E:

@@ -77,6 +77,8 @@ if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))'
         exit 1
     }
 fi
+# egl_probe asks for a CMake before 3.5, which CMake 4 refuses to be.
+export CMAKE_POLICY_VERSION_MINIMUM="${CMAKE_POLICY_VERSION_MINIMUM:-3.5}"
 say "installing Python packages in .venv (some GB the first time)"
 install_python_packages() {
     "$uv" pip install --quiet --python .venv/bin/python -c constraints.txt -e '.[libero,robotwin,test]'

@@ -1,12 +1,24 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then runs the tests. Arguments go to pytest.
+# Sets up what is missing, checks style (ruff), then runs the tests on two cores. Arguments go to pytest; --quick runs
+# what needs no simulator, no LeRobot and no browser, --nightly the whole sweeps, too.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 scripts/setup.sh
+.venv/bin/ruff check --quiet .
+.venv/bin/ruff format --quiet --check . || {
+    echo "the format is not ruff's: .venv/bin/ruff format ." >&2
+    exit 1
+}
+.venv/bin/lint-imports --no-cache >/dev/null || {
+    .venv/bin/lint-imports --no-cache --no-logo >&2 || true
+    echo "imports point one way (CONTRIBUTING.md; tool.importlinter in pyproject.toml)" >&2
+    exit 1
+}
 # Simulators are single-threaded; a thread pool each only makes them fight for the cores.
 export MUJOCO_GL="${MUJOCO_GL:-egl}" OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 # SAPIEN renders in software where scripts/setup.sh could get a driver for it.
 if [[ -z "${VK_ICD_FILENAMES:-}" ]] && icd="$(scripts/vulkan.sh 2>/dev/null)"; then
     export VK_ICD_FILENAMES="$icd"
 fi
-PATH="$PWD/.venv/bin:$PATH" exec .venv/bin/python -m pytest -n 2 --dist loadfile "$@"
+# A worker that has nothing left takes the other's last tests: neither waits for the other's longest file.
+PATH="$PWD/.venv/bin:$PATH" exec .venv/bin/python -m pytest -n 2 --dist worksteal "$@"

@@ -23,8 +23,9 @@ def test_importing_the_package_is_light():
 
 def test_a_worker_needs_neither_lerobot_nor_torch():
     code = (
-        "from lerobot_roborecover.env import worker, slot_server\n"
-        "from lerobot_roborecover.env.episode import SlotConfig\n"
+        "from lerobot_roborecover.env import slot_server\n"
+        "from lerobot_roborecover.workers import jobs, worker\n"
+        "from lerobot_roborecover.workers.messages import SlotConfig\n"
         "slot_server.SlotServer(SlotConfig('fake'))"
     )
     assert not modules_after(code) & set(HEAVY)
@@ -33,7 +34,7 @@ def test_a_worker_needs_neither_lerobot_nor_torch():
 def test_a_running_metaworld_worker_loads_neither_lerobot_nor_torch():
     code = (
         "from lerobot_roborecover.env.slot_server import SlotServer\n"
-        "from lerobot_roborecover.env.episode import EpisodeSpec, SlotConfig\n"
+        "from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig\n"
         "from lerobot_roborecover import load_scenarios\n"
         "server = SlotServer(SlotConfig('metaworld', {'obs_type': 'state'}))\n"
         "server.answer('reset', EpisodeSpec(load_scenarios('metaworld_starter')[0], 'recovery', 0, True))"

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from lerobot_roborecover.rounding import CORE_TYPE, VARIABLE, has_kernels
+from lerobot_roborecover.rounding import CORE_TYPE, KERNELS, VARIABLE, has_kernels, policy_kernels
 
-needs_kernels = pytest.mark.skipif(not has_kernels(), reason="this processor has no AVX2")
+needs_kernels = pytest.mark.skipif(not has_kernels(), reason="no AVX2 in this processor: nothing to do")
 CODE = "from lerobot_roborecover.rounding import core_type_in_use; print(core_type_in_use())"
 
 
@@ -49,3 +49,27 @@ def test_kernels_that_would_crash_the_processor_are_not_chosen(tmp_path, monkeyp
     assert not has_kernels(tmp_path / "missing")
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
     assert not has_kernels(cpuinfo)
+
+
+@pytest.mark.parametrize("can", [True, False])
+def test_a_policy_gets_kernels_that_its_processor_has(monkeypatch, can):
+    monkeypatch.setattr("lerobot_roborecover.rounding.has_kernels", lambda: can)
+    assert policy_kernels() == (dict(KERNELS) if can else {"OMP_NUM_THREADS": "1"})
+
+
+def test_the_shipped_study_names_them():
+    from lerobot_roborecover.study.definition import read_definition, shipped_study
+
+    assert read_definition(shipped_study()).environment == KERNELS
+
+
+@needs_kernels
+@pytest.mark.lerobot
+def test_square_roots_in_float64_round_to_the_float32_that_is_right():
+    """Those in float32 do not, with any kernels: a noise schedule has to be in float64."""
+    code = (
+        "import numpy as np, torch; x = np.random.default_rng(0).random(1 << 16).astype('f4');"
+        "roots = torch.sqrt(torch.from_numpy(x).double()).float().numpy();"
+        "print(int((roots != np.sqrt(x)).sum()))"
+    )
+    assert core_type(code, **KERNELS) == "0"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
 from lerobot_roborecover import whole
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import check_new, new_file, new_folder, write_whole
+from lerobot_roborecover.whole import check_new, forget_stale, new_file, new_folder, write_whole
 
 
 def names(folder):
@@ -111,3 +115,66 @@ def test_an_earlier_folder_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch
     write_folder(root, "new", replace=True)
     assert names(root) == ["new"]
     assert names(tmp_path) == ["set"]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from lerobot_roborecover.whole import new_folder
+with new_folder(Path(sys.argv[1])) as outer, new_folder(outer) as inner:
+    inner.mkdir()
+    (inner / "half").touch()
+    print("up", flush=True)
+    if sys.argv[2] == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    sys.stdin.read()
+"""
+
+
+def writer(root, how):
+    return subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(root), how], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+
+
+def test_what_a_killed_writer_left_is_taken_away_by_the_next_and_a_living_one_is_left_alone(tmp_path):
+    root, other = tmp_path / "set", tmp_path / "set.old"
+    other.mkdir()
+    with writer(root, "kill") as killed:
+        assert killed.wait() == -signal.SIGKILL
+    # Two folders are announced, and only the inner one is made.
+    left = names(tmp_path)
+    assert [n.split(".")[-1] for n in left] == ["lock", "tmp", "lock", "old"]
+    with writer(root, "wait") as living:
+        assert living.stdout.readline() == b"up\n"
+        there = names(tmp_path)
+        assert len(there) == 4
+        assert not set(left[:3]) & set(there), "the killed writer's are gone"
+        assert forget_stale(root) == []
+        assert names(tmp_path) == there, "the living writer's are left alone"
+        living.communicate(b"")
+    assert names(tmp_path) == ["set", "set.old"]
+    assert names(root) == ["half"]
+
+
+def test_an_earlier_folder_comes_back_when_its_writer_was_killed_in_between(tmp_path):
+    old = tmp_path / ".set.99999999.old"
+    old.mkdir()
+    (old / "earlier").touch()
+    write_folder(tmp_path / "set2", "new")
+    assert old.exists(), "another folder's"
+    with pytest.raises(ScenarioError, match="not an empty folder"):
+        write_folder(tmp_path / "set", "new")
+    assert names(tmp_path / "set") == ["earlier"]
+    write_folder(tmp_path / "set", "new", replace=True)
+    assert names(tmp_path) == ["set", "set2"]
+
+
+def test_old_leftovers_of_a_file_are_taken_away(tmp_path):
+    dead, young, alive = (tmp_path / f".file.{n}.tmp" for n in (99999999, 99999998, 1))
+    for path in (dead, young, alive):
+        path.touch()
+    for path in (dead, alive):
+        os.utime(path, (time.time() - 7200,) * 2)
+    write_whole(tmp_path / "file", "new")
+    assert names(tmp_path) == [alive.name, young.name, "file"]

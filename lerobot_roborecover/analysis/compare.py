@@ -6,28 +6,22 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.contrasts import (
-    POWER,
-    Contrast,
-    Share,
-    contrasts,
-    contributions,
-    profile_difference,
-    scenarios_needed,
-)
+from lerobot_roborecover.analysis.contrasts import Contrast, Share, contributions
+from lerobot_roborecover.analysis.crossfit import Profile, profile_difference
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.logs import Arm, Study
-from lerobot_roborecover.analysis.panel import Panel, make_panel
-from lerobot_roborecover.analysis.resampling import Resampling, resample
-from lerobot_roborecover.analysis.results import Options
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW, Estimate
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.logs import Study
+from lerobot_roborecover.analysis.panel import Panel
+from lerobot_roborecover.analysis.results import Options, Results, analyse
+from lerobot_roborecover.analysis.runs import MethodContrast, MethodRate
+from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.tables import NOT_DEFINED, Column, Table, cell_text, to_text
-from lerobot_roborecover.scenario import Start
+from lerobot_roborecover.analysis.units import ESTIMAND, Unit
+from lerobot_roborecover.analysis.verdicts import Verdict, method_text, verdict_text
 
 _BAR_WIDTH = 41
 
@@ -43,19 +37,22 @@ class Comparison:
     invalid: tuple[int, int]
     rsr: tuple[Estimate, Estimate]
     contrast: Contrast
-    """A minus B, with p adjusted for all pairs of policies in the logs."""
-    pairs: int
-    """Pairs that p is adjusted for."""
+    """A minus B, with p adjusted for the family of the question."""
+    decision: Verdict
+    """What may be said of the two."""
+    tasks: Estimate | None
+    """The difference with its interval for other tasks like these; None where tasks are resampled anyhow."""
     initial: Contrast | None
     """The same from initial states, where both have such trials."""
-    profile: Estimate
-    """Mean absolute difference of the scenario rates."""
-    higher: tuple[int, int, int]
-    """Scenarios on which A is higher, B is higher, both are equal."""
+    profile: Profile
+    """How differently the two do, scenario by scenario."""
     cells: tuple[Share, ...]
-    needed: int | None
-    """Scenarios that would separate the two; None where they are separated, or no number would."""
+    methods: tuple[MethodRate, MethodRate] | None
+    """The two as methods of several runs; None where each has one run."""
+    of_methods: MethodContrast | None
+    """What may be said of the methods; None where each has one run, or one is an intervention."""
     verdict: str
+    """The decision in words."""
     resampling: dict[str, Any]
     remarks: tuple[str, ...]
 
@@ -63,58 +60,70 @@ class Comparison:
 def compare(
     study: Study, a: str | None = None, b: str | None = None, options: Options | None = None
 ) -> Comparison:
-    """Compares two policies of a study.
+    """Compares two policies of a study, or an intervention with its direct control.
 
     Args:
         study: their trials, and maybe others'.
         a: title of the first; by default the first of the only two.
         b: title of the second.
-        options: draws, seed, level, scheduled trials.
+        options: draws, seed, level, scheduled trials, and the like.
 
     Raises:
-        RowsError: it is not clear which two, or they have no scenario in common.
+        RowsError: it is not clear which two, they are no one question, or they have no scenario in common.
     """
-    options = options or Options()
-    arms = [*study.of(Start.RECOVERY), *study.of(Start.REVERSION)]
-    first, second = _choose([arm.title for arm in arms], a, b)
-    everyone = make_panel(arms, options.scheduled)
-    p, q = everyone.arm(first), everyone.arm(second)
-    common = np.isfinite(everyone.rates[[p, q]]).all(0)
-    if not common.any():
+    results = analyse(study, options)
+    options = results.options
+    policies = results.recovery.arms
+    acting = () if results.interventions is None else results.interventions.arms
+    named = [arm.title for arm in study.arms]  # A is whose log was named first, not who is better
+    first, second = _choose(tuple(sorted({*policies, *acting}, key=named.index)), a, b)
+    contrast = results.contrast(first, second)
+    if options.sequential and not contrast.scenarios:
+        raise RowsError(
+            f"--sequential: no scenario's turn has come in {first} and {second}. It counts scenarios in the "
+            "order in which roborecover eval --sequential runs them"
+        )
+    if not contrast.scenarios:
         raise RowsError(f"{first} and {second} were run on different scenarios: there is none in common")
-    ids = [s.id for s, both in zip(everyone.scenarios, common, strict=True) if both]
-    panel = make_panel(arms, options.scheduled, ids)
-    draws = resample(panel.units(), options.draws, options.seed, options.level)
-    pairs = list(combinations(range(len(arms)), 2))
-    if (p, q) not in pairs:
-        pairs[pairs.index((q, p))] = (p, q)
-    contrast = contrasts(panel.rates, panel.arms, draws, pairs)[pairs.index((p, q))]
-    profile, *higher = profile_difference(panel.rates[p], panel.rates[q], draws)
-    rsr = draws.estimates(panel.rates[[p, q]].T)
-    needed = None if _separated(contrast, options.level) else scenarios_needed(contrast, options.level)
+    panel = _pair_panel(results, first, second)
+    draws = results.resample(panel)
+    rsr = draws.rates(panel.rates.T)
+    everyone = len((results.recovery if first in policies and second in policies else panel).scenarios)
     remarks = [
-        r for r in study.remarks if first in r or second in r or not any(arm.policy in r for arm in arms)
+        r
+        for r in results.remarks
+        if r != results.compared.words
+        and (first in r or second in r or not any(arm in r for arm in policies))
     ]
-    if len(ids) < len(everyone.scenarios):
-        remarks.append(f"only the {len(ids)} scenarios that both were run on are compared")
-    if {arms[p].start, arms[q].start} != {Start.RECOVERY}:
-        remarks.append("the two start from different states: this measures an intervention, not a policy")
+    if contrast.scenarios < everyone:
+        remarks.append(
+            f"only {contrast.scenarios} of {everyone} scenarios, which both were run on, are compared"
+        )
+    if first not in policies or second not in policies:
+        remarks.append("one of the two is an intervention: this measures the intervention, not a policy")
+    methods = _methods(results, first, second)
     return Comparison(
         first,
         second,
-        len(ids),
-        (int(panel.trials[p].sum()), int(panel.trials[q].sum())),
-        (int(panel.invalid[p].sum()), int(panel.invalid[q].sum())),
+        contrast.scenarios,
+        (int(panel.trials[0].sum()), int(panel.trials[1].sum())),
+        (int(panel.invalid[0].sum()), int(panel.invalid[1].sum())),
         (rsr[0], rsr[1]),
         contrast,
-        len(pairs),
-        _initial(study, arms[p], arms[q], options),
-        profile,
-        tuple(higher),
-        tuple(contributions(panel.rates[p], panel.rates[q], panel.labels("cell"))),
-        needed,
-        _verdict(contrast, len(pairs), needed, options.level),
-        _resampling(panel, draws),
+        contrast.verdict,
+        _tasks(results, panel),
+        _initial(results, first, second),
+        profile_difference(panel, 0, 1, draws),
+        tuple(contributions(panel.rates[0], panel.rates[1], panel.labels("cell"))),
+        None if methods is None else methods[0],
+        None if methods is None else methods[1],
+        verdict_text(contrast),
+        {
+            "unit": results.unit,
+            "units": draws.units,
+            "estimand": ESTIMAND[panel.unit(options.cluster)],
+            "level": options.level,
+        },
         tuple(dict.fromkeys(remarks)),
     )
 
@@ -140,53 +149,44 @@ def _choose(titles: Sequence[str], a: str | None, b: str | None) -> tuple[str, s
     return a, b
 
 
-def _initial(study: Study, a: Arm, b: Arm, options: Options) -> Contrast | None:
-    starts = {arm.policy: arm for arm in study.of(Start.INITIAL)}
-    if a.policy == b.policy or a.policy not in starts or b.policy not in starts:
+def _pair_panel(results: Results, a: str, b: str) -> Panel:
+    """The two on the scenarios that their contrast is over."""
+    whole = results.recovery
+    if not {a, b} <= set(whole.arms):
+        whole = results.interventions or whole
+    elif {a, b} <= set(results.ranked.arms):
+        whole = results.ranked
+    both = [whole.arm(a), whole.arm(b)]
+    common = np.flatnonzero(np.isfinite(whole.rates[both]).all(0))
+    return whole.take(both, common.tolist())
+
+
+def _tasks(results: Results, panel: Panel) -> Estimate | None:
+    """The difference with its interval for other tasks; None where tasks are the units anyhow."""
+    if panel.unit(results.options.cluster) is Unit.TASK:
         return None
-    panel = make_panel([Arm(x.policy, Start.RECOVERY, 0, starts[x.policy].rows) for x in (a, b)])
-    draws = resample(panel.units(), options.draws, options.seed, options.level)
-    return contrasts(panel.rates, panel.arms, draws)[0]
+    return results.resample(panel, Unit.TASK).differences((panel.rates[0] - panel.rates[1])[:, None])[0]
 
 
-def _resampling(panel: Panel, draws: Resampling) -> dict[str, Any]:
-    unit = "trajectory clusters" if panel.scenarios[0].platform == "robotwin" else "scenarios"
-    return {
-        "draws": len(draws.weights),
-        "seed": draws.seed,
-        "level": draws.level,
-        "unit": unit,
-        "units": draws.units,
-    }
+def _methods(results: Results, a: str, b: str) -> tuple[tuple[MethodRate, MethodRate], MethodContrast] | None:
+    """The two as methods of several runs; None where neither has several, or one is an intervention."""
+    names = results.recovery.arms
+    if not {a, b} <= set(names):
+        return None
+    both = results.method_rates[names.index(a)], results.method_rates[names.index(b)]
+    if all(len(m.each) == 1 for m in both):
+        return None
+    for c in results.method_contrasts:
+        if {c.these_runs.a, c.these_runs.b} == {a, b}:
+            return both, c if c.these_runs.a == a else c.turned()
+    raise AssertionError("every pair of policies has a contrast")
 
 
-def _separated(contrast: Contrast, level: float) -> bool:
-    clear = contrast.difference.low > 0 or contrast.difference.high < 0
-    return clear and contrast.p_holm < 1 - level
-
-
-def _verdict(contrast: Contrast, pairs: int, needed: int | None, level: float) -> str:
-    d = contrast.difference
-    points = f"{abs(100 * d.value):.1f} points"
-    better = contrast.a if d.value > 0 else contrast.b
-    if math.isnan(d.low):
-        return f"Not separated: {contrast.scenarios} scenario(s) say nothing about others. Evaluate on more."
-    if _separated(contrast, level):
-        return f"{better} is better, by {points}."
-    if d.low > 0 or d.high < 0:
-        return (
-            f"Not separated once p is adjusted for {pairs} pairs, though the interval of this pair "
-            "alone is clear of "
-            f"zero ({better} ahead by {points})."
-        )
-    if needed is None:
-        return "Not separated: no difference was observed, so no number of scenarios can be named."
-    return (
-        f"Not separated with these trials: {better} is ahead by {points}. Were that the true "
-        "difference, it would take "
-        f"about {needed - contrast.scenarios} more scenarios ({needed} in all) to show it with "
-        f"{100 * POWER:.0f} % chance."
-    )
+def _initial(results: Results, a: str, b: str) -> Contrast | None:
+    for c in results.initial_contrasts:
+        if {c.a, c.b} == {a, b} and c.scenarios:
+            return c if c.a == a else c.turned()
+    return None
 
 
 def to_screen(found: Comparison) -> str:
@@ -206,21 +206,32 @@ def to_screen(found: Comparison) -> str:
         Column("Invalid", "count"),
     )
     lines = [to_text(Table("rates", "", columns, tuple(rows))), ""]
-    points = Column("", "points")
-    p = Column("", "p")
+    points, p = Column("", "points"), Column("", "p")
+    c, r = found.contrast, found.resampling
     lines.append(
         f"A − B      {cell_text(d, points)} points ({level} interval), {found.scenarios} common scenarios"
     )
     lines.append(f"           {_bar(d)}")
-    adjusted = f"adjusted for {found.pairs} pairs (Holm)" if found.pairs > 1 else "the only pair"
-    lines.append(f"p          {cell_text(found.contrast.p_holm, p)}, {adjusted}")
+    if found.tasks is not None:
+        lines.append(f"           {cell_text(found.tasks, points)} for other tasks like these")
+    adjusted = f"adjusted for {c.family} pairs (Holm)" if c.family > 1 else "the only pair of its family"
+    shown = c.p_holm if c.complete else c.p
+    adjusted = adjusted if c.complete else "not adjusted: not both are complete"
+    if c.sequential:
+        adjusted += "; holds at every look (sequential)"
+    lines.append(
+        f"p          {cell_text(shown, p)}, {adjusted}; sign flips of {c.differing} differing {c.unit}"
+    )
+    if found.methods is not None:
+        lines += _runs_lines(found, points)
     if found.initial is not None:
         lines.append(f"initially  {cell_text(found.initial.difference, points)} points from initial states")
-    a, b, equal = found.higher
-    lines.append(
-        f"profiles   A higher on {a} scenarios, B on {b}, equal on {equal}; mean absolute difference "
-        f"{cell_text(found.profile, points)}"
-    )
+    w = found.profile
+    lines += [
+        f"profiles   A higher on {w.higher} scenarios, B on {w.lower}, equal on {w.equal}",
+        f"           mean absolute difference {cell_text(w.hindsight, points)}, by chance alone "
+        f"{cell_text(w.floor, points)} points",
+    ]
     width = max(len(share.group) for share in found.cells) + 2
     lines += ["", f"  {'Where it comes from':<{width}}  adds up to A − B, points"]
     for share in found.cells:
@@ -231,11 +242,31 @@ def to_screen(found: Comparison) -> str:
         )
     if any(share.scenarios < UNDERPOWERED_BELOW for share in found.cells):
         lines.append(f"  * fewer than {UNDERPOWERED_BELOW} scenarios")
-    lines += ["", textwrap.fill(found.verdict, 100)]
+    these = "" if found.of_methods is None else "Of these runs: "
+    lines += ["", textwrap.fill(these + found.verdict, 100)]
+    if found.of_methods is not None:
+        lines.append(textwrap.fill(method_text(found.of_methods), 100))
     lines += [textwrap.fill(f"Note: {remark}", 100) for remark in found.remarks]
-    r = found.resampling
-    lines.append(f"Bootstrap: {r['draws']} draws over {r['units']} {r['unit']}, seed {r['seed']}.")
+    lines.append(f"Intervals and test over {r['units']} {r['unit']}: they speak of {r['estimand']}.")
     return "\n".join(lines)
+
+
+def _runs_lines(found: Comparison, points: Column) -> list[str]:
+    """How far the runs of each method lie apart."""
+    lines, percent = [], Column("", "percent")
+    for m in found.methods or ():
+        text = (
+            f"{len(m.each)} runs, {100 * m.lowest:.1f} to {100 * m.highest:.1f} %, SD {100 * m.sd:.1f} points"
+        )
+        if len(m.each) == 1:
+            text = "1 run"
+        elif not math.isnan(m.other_runs.low):
+            text += f"; {cell_text(m.other_runs, percent)} % for other runs like these"
+        lines.append(f"runs       {m.method}: {text}")
+    if found.of_methods is not None and not math.isnan(found.of_methods.difference.low):
+        of = cell_text(found.of_methods.difference, points)
+        lines.append(f"           A − B {of} points for other runs like these")
+    return lines
 
 
 def _bar(d: Estimate) -> str:

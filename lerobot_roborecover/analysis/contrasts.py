@@ -1,21 +1,18 @@
-"""Paired contrasts of policies on the same draws, adjusted for their number; what would settle one."""
+"""Paired contrasts of policies on the same scenarios, adjusted for their number."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy import stats
 
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
-from lerobot_roborecover.analysis.summary import Estimate
-
-POWER = 0.8
-"""Chance of separating two policies at which `scenarios_needed` plans."""
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.permutation import differing, sign_flip_p
+from lerobot_roborecover.analysis.resampling import Resampling
+from lerobot_roborecover.analysis.verdicts import Verdict, verdict
 
 
 @dataclass(frozen=True)
@@ -27,14 +24,33 @@ class Contrast:
     difference: Estimate
     """Of the two rates, in [-1, 1]."""
     p: float
-    """Two-sided bootstrap p-value of no difference; NaN where nothing can be resampled."""
+    """Two-sided p-value of the paired sign-flip permutation test; NaN without a common scenario."""
     p_holm: float
-    """The same after Holm's adjustment for all contrasts of the family."""
-    standard_error: float
-    """Of the difference, from the draws."""
+    """The same after Holm's adjustment for all contrasts of the family; NaN for one outside of it."""
     scenarios: int
     units: int
-    """Resampled units of the whole set: scenarios, or trajectory clusters."""
+    """Units of those scenarios: scenarios, trajectory clusters, or tasks."""
+    differing: int
+    """Units on which the two differ."""
+    family: int
+    """Contrasts that p is adjusted for."""
+    complete: bool
+    """Whether both were run on all the scenarios of the comparison; other contrasts are in no family."""
+    level: float
+    unit: str
+    """What the units are, in words."""
+    sequential: bool = False
+    """Whether p and interval hold although the run was watched, and stopped when it was decided."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """What may be said of the two."""
+        return verdict(self)
+
+    def turned(self) -> Contrast:
+        """The same, b minus a."""
+        d = self.difference
+        return replace(self, a=self.b, b=self.a, difference=Estimate(-d.value, -d.high, -d.low))
 
 
 def contrasts(
@@ -42,75 +58,79 @@ def contrasts(
     names: Sequence[str],
     resampling: Resampling,
     pairs: Sequence[tuple[int, int]] | None = None,
+    *,
+    unit: str = "scenarios",
+    complete: bool = True,
 ) -> list[Contrast]:
-    """All paired contrasts.
+    """Paired contrasts, which are one family: what is asked of them is one question.
 
     Args:
         rates: (P, N) in [0, 1]; NaN where a policy was not run.
         names: P names.
-        resampling: of the N scenarios; every pair uses the same draws.
-        pairs: which, by index; by default all. They are one family for Holm's adjustment.
+        resampling: of the N scenarios.
+        pairs: which, by index; by default all.
+        unit: what is resampled, in words.
+        complete: whether the policies are complete; p is not adjusted, and nothing said, where they are not.
     """
-    from statsmodels.stats.multitest import multipletests
-
     pairs = list(combinations(range(len(rates)), 2)) if pairs is None else list(pairs)
     if not pairs:
         return []
-    first, second = np.array(pairs).T
-    values = (rates[first] - rates[second]).T  # (N, pairs)
-    draws = resampling.means(values)
-    low, high = resampling.interval(draws)
-    points, counts = masked_mean(values), np.isfinite(values).sum(0)
-    p = np.array([_p_value(draws[:, k]) if counts[k] > 1 else np.nan for k in range(len(pairs))])
-    adjusted = np.full(len(pairs), np.nan)
-    known = np.isfinite(p)
-    if known.any():
-        adjusted[known] = multipletests(p[known], method="holm")[1]
-    spread = np.array(
-        [
-            np.nanstd(draws[:, k], ddof=1) if counts[k] > 1 and resampling.units > 1 else np.nan
-            for k in range(len(pairs))
-        ]
-    )
-    return [
+    differences = np.stack([rates[a] - rates[b] for a, b in pairs])
+    totals = [_unit_totals(values, resampling) for values in differences]
+    columns = resampling.spread(differences)
+    estimates = resampling.differences(differences.T)
+    found = [
         Contrast(
             names[a],
             names[b],
-            Estimate(float(points[k]), float(low[k]), float(high[k]))
-            if counts[k] > 1
-            else Estimate(float(points[k]), np.nan, np.nan),
-            float(p[k]),
-            float(adjusted[k]),
-            float(spread[k]),
-            int(counts[k]),
-            resampling.units,
+            estimates[k],
+            sign_flip_p(totals[k]),
+            float("nan"),
+            int(np.isfinite(differences[k]).sum()),
+            int(columns.units[k]),
+            differing(totals[k]),
+            0,
+            complete,
+            resampling.level,
+            unit,
         )
         for k, (a, b) in enumerate(pairs)
     ]
+    return adjusted(found)
 
 
-def _p_value(draws: np.ndarray) -> float:
-    """Twice the smaller share of draws at or beyond zero, never below what the number of draws can show."""
-    draws = draws[np.isfinite(draws)]
-    if not len(draws):
-        return float("nan")
-    # A difference of means of few-valued rates is exactly zero often; rounding must not move it to one side.
-    draws = np.where(np.abs(draws) < 1e-12, 0.0, draws)
-    smaller = min((draws <= 0).sum(), (draws >= 0).sum())
-    return float(min(1.0, 2 * (smaller + 1) / (len(draws) + 1)))
+def adjusted(found: Sequence[Contrast]) -> list[Contrast]:
+    """The contrasts with p adjusted by Holm's rule; the complete ones among them are one family."""
+    p = np.array([c.p if c.complete else np.nan for c in found])
+    known = np.isfinite(p)
+    p[known] = holm(p[known])
+    family = int(known.sum())
+    return [
+        replace(c, p_holm=float(q), family=family if c.complete else 0) for c, q in zip(found, p, strict=True)
+    ]
 
 
-def scenarios_needed(contrast: Contrast, level: float = 0.95, power: float = POWER) -> int | None:
-    """Scenarios at which the interval would leave out zero with the given chance.
+def holm(p: np.ndarray) -> np.ndarray:
+    """p-values adjusted for all tests of a family (Holm 1979); the smallest is multiplied by their number,
+    the next one by one less, and none falls below one before it.
 
-    Takes the difference to be as observed; the standard error falls with the square root of the number of
-    scenarios. None where there is no difference to detect or no standard error.
+    Args:
+        p: (..., tests).
     """
-    d, se = contrast.difference.value, contrast.standard_error
-    if not (math.isfinite(d) and math.isfinite(se)) or abs(d) < 1e-12 or se <= 0:
-        return None
-    reach = stats.norm.ppf(0.5 + level / 2) + stats.norm.ppf(power)
-    return max(contrast.scenarios, math.ceil(contrast.scenarios * (reach * se / abs(d)) ** 2))
+    order = np.argsort(p, axis=-1)
+    times = np.arange(p.shape[-1], 0, -1)
+    adjusted = np.maximum.accumulate(np.take_along_axis(p, order, -1) * times, axis=-1)
+    found = np.empty_like(p)
+    np.put_along_axis(found, order, np.minimum(adjusted, 1.0), -1)
+    return found
+
+
+def _unit_totals(values: np.ndarray, resampling: Resampling) -> np.ndarray:
+    """Sums over each unit with a value."""
+    known = np.isfinite(values)
+    index = resampling.index[known]
+    totals = np.bincount(index, values[known], resampling.units)
+    return totals[np.bincount(index, minlength=resampling.units) > 0]
 
 
 @dataclass(frozen=True)
@@ -145,27 +165,3 @@ def contributions(a: np.ndarray, b: np.ndarray, groups: np.ndarray) -> list[Shar
         inside = difference[known & (groups == group)]
         shares.append(Share(str(group), len(inside), float(inside.mean()), float(inside.sum() / known.sum())))
     return sorted(shares, key=lambda s: (-abs(s.contribution), s.group))
-
-
-def profile_difference(
-    a: np.ndarray, b: np.ndarray, resampling: Resampling
-) -> tuple[Estimate, int, int, int]:
-    """Mean absolute difference of two policies' scenario rates, however close their means.
-
-    Args:
-        a: (N,) rates; NaN where not run.
-        b: (N,) rates.
-        resampling: of the scenarios.
-
-    Returns:
-        The estimate, and on how many scenarios a is higher, b is higher, both are equal.
-    """
-    difference = a - b
-    (estimate,) = resampling.estimates(np.abs(difference)[:, None])
-    known = difference[np.isfinite(difference)]
-    return (
-        estimate,
-        int((known > 1e-12).sum()),
-        int((known < -1e-12).sum()),
-        int((np.abs(known) <= 1e-12).sum()),
-    )

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.summary import Estimate
 from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow
 
 
@@ -33,7 +33,8 @@ class InterventionCost:
     extra_steps: Estimate
     """Environment steps per trial more than direct control; a rewound start's steps count as all others."""
     triggered: Estimate
-    """Share of trials in which anything intervened (monitor calls alone do not count)."""
+    """Share of trials in which anything intervened (monitor calls alone do not count); NaN where the logs do
+    not say."""
     per_trial: Mapping[str, float]
     """Mean count of each kind per trial; `monitor calls` among them."""
     matched: int
@@ -61,13 +62,16 @@ def intervention_cost(panel: Panel, baseline: int, arm: int, resampling: Resampl
     steps, triggered = np.full(count, np.nan), np.full(count, np.nan)
     totals: Counter[str] = Counter()
     trials = matched = rescued = harmed = 0
+    # Logs without any entry, of a rewound start or of stored outcomes, do not say when something intervened.
+    told = any(r.interventions for (p, _), rows in panel.rows.items() if p == arm for r in rows)
     for n in np.flatnonzero(both):
         direct, acted = panel.rows.get((baseline, n), ()), panel.rows.get((arm, n), ())
         if not direct or not acted:
             continue
         steps[n] = np.mean([r.steps for r in acted]) - np.mean([r.steps for r in direct])
         kinds = [intervention_kinds(r) for r in acted]
-        triggered[n] = np.mean([any(k != "monitor calls" for k in kind) for kind in kinds])
+        if told:
+            triggered[n] = np.mean([any(k != "monitor calls" for k in kind) for kind in kinds])
         for kind in kinds:
             totals.update(kind)
         trials += len(acted)
@@ -78,8 +82,14 @@ def intervention_cost(panel: Panel, baseline: int, arm: int, resampling: Resampl
                 rescued += row.success and not before[row.trial]
                 harmed += before[row.trial] and not row.success
     rates = np.where(both, panel.rates[[baseline, arm]], np.nan)
-    columns = np.stack([rates[0], rates[1], rates[1] - rates[0], steps, triggered], 1)
-    direct, acted, gain, extra, share = resampling.estimates(columns)
+    direct, acted, share = resampling.rates(np.stack([rates[0], rates[1], triggered], 1))
+    (gain,) = resampling.differences((rates[1] - rates[0])[:, None])
+    # Steps lie between none and the horizon: few trials of many equal ones must not look sure of themselves.
+    most = max(
+        [s.horizon for s in panel.scenarios] + [float(np.abs(steps[np.isfinite(steps)]).max(initial=1))]
+    )
+    (share_of_most,) = resampling.differences(steps[:, None] / most)
+    extra = Estimate(*(most * v for v in (share_of_most.value, share_of_most.low, share_of_most.high)))
     return InterventionCost(
         panel.arms[baseline],
         panel.arms[arm],

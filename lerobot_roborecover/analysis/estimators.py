@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.analysis.intervals import LEVEL, clean
+from lerobot_roborecover.analysis.units import Unit, default_unit, unit_labels
+from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Outcome
 
 DRAWS = 10_000
-LEVEL = 0.95
 
 
-class RowsError(ValueError):
+class RowsError(RoboRecoverError, ValueError):
     """Trial rows do not belong together; the message says which and why."""
 
 
@@ -38,8 +40,8 @@ class ScenarioRates:
     cells: tuple[str, ...]
     """Stage × deviation type, e.g. `Approach-Wrong Pose`."""
     sources: tuple[str, ...]
-    clusters: tuple[str, ...]
-    """Resampling units; a scenario without a cluster is its own."""
+    units: tuple[str, ...]
+    """What is independent of the others: see `units.py`."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -55,17 +57,20 @@ class ScenarioRates:
             self.invalid[index],
             take(self.cells),
             take(self.sources),
-            take(self.clusters),
+            take(self.units),
         )
 
 
-def scenario_rates(rows: Sequence[Mapping[str, Any]], scheduled: int | None = None) -> ScenarioRates:
+def scenario_rates(
+    rows: Sequence[Mapping[str, Any]], scheduled: int | None = None, unit: Unit | None = None
+) -> ScenarioRates:
     """Success rate of every scenario that has a row.
 
     Args:
         rows: trials of one policy, one start and one protocol.
         scheduled: trials every scenario was to have; those without a row count as failures. None takes the
             rows for all there is.
+        unit: what is independent; by default what the paper resamples on the rows' platform.
 
     Raises:
         RowsError: a trial occurs twice, a scenario's labels disagree, or more trials than scheduled.
@@ -96,10 +101,23 @@ def scenario_rates(rows: Sequence[Mapping[str, Any]], scheduled: int | None = No
         invalid=np.array([sum(not Outcome(r["outcome"]).valid for r in g) for g in groups], dtype=int),
         cells=tuple(_label(g, lambda r: f"{r['stage']}-{r['deviation']}") for g in groups),
         sources=tuple(_label(g, lambda r: r["source"]) for g in groups),
-        clusters=tuple(
-            _label(g, lambda r: r.get("cluster") or f"scenario:{r['scenario_id']}") for g in groups
-        ),
+        units=_units(ids, groups, unit),
     )
+
+
+def _units(ids: Sequence[str], groups: list[list[Mapping[str, Any]]], unit: Unit | None) -> tuple[str, ...]:
+    platforms = sorted({str(r.get("platform", "")) for g in groups for r in g})
+    if len(platforms) > 1:
+        raise RowsError(
+            f"the rows are of {len(platforms)} platforms ({', '.join(platforms)}); take one at a time"
+        )
+    labels = unit_labels(
+        unit or default_unit(platforms[0] if platforms else ""),
+        ids,
+        [_label(g, lambda r: r.get("cluster") or "") for g in groups],
+        [_label(g, lambda r: f"{r.get('suite', '')}/{r.get('task', '')}") for g in groups],
+    )
+    return tuple(labels.tolist())
 
 
 def _label(group: list[Mapping[str, Any]], read) -> str:
@@ -148,7 +166,9 @@ def bootstrap_interval(
     level: float = LEVEL,
     rng: np.random.Generator | None = None,
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of `rsr`, or of `macro` where cells are given.
+    """The paper's interval: percentile bootstrap of `rsr`, or of `macro` where cells are given.
+
+    It stays to be compared with the paper; what is printed as the interval is `intervals.py`'s, which covers.
 
     A draw takes as many scenarios (or clusters) as there are, with replacement. In a draw that leaves a cell
     empty, the macro rate is the mean over the others.
@@ -170,10 +190,16 @@ def bootstrap_interval(
     if count < 2:
         return float("nan"), float("nan")
     rng = rng or np.random.default_rng(0)
-    weights = rng.multinomial(count, np.full(count, 1 / count), size=draws)[:, units]  # (draws, n)
+    weights = draw_counts(rng, count, draws)[:, units]  # (draws, n)
     values = weights @ rates / weights.sum(1) if cells is None else _macro_of_draws(rates, cells, weights)
     low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+    return float(clean(low)), float(clean(high))
+
+
+def draw_counts(rng: np.random.Generator, units: int, draws: int) -> np.ndarray:
+    """(draws, units) int: how often each unit is in each draw of as many with replacement."""
+    drawn = rng.integers(units, size=(draws, units)) + units * np.arange(draws)[:, None]
+    return np.bincount(drawn.ravel(), minlength=draws * units).reshape(draws, units)
 
 
 def _macro_of_draws(rates: np.ndarray, cells: Sequence[str], weights: np.ndarray) -> np.ndarray:

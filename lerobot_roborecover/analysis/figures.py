@@ -4,37 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.contrasts import contrasts
 from lerobot_roborecover.analysis.figures_trials import interventions, mosaic, oracle_bars, time_to_recover
 from lerobot_roborecover.analysis.groups import group_rates, source_matrix
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.report_tables import initial_estimates
 from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.runs_tables import runs_figure
 from lerobot_roborecover.analysis.style import (
     HEAT,
     INK,
     LINE,
+    ON_COLOUR,
+    ON_LIGHT,
+    PAPER,
     SOFT,
     Figure,
+    Width,
+    both,
     colour,
     drawing,
     marker,
+    name_rows,
     number,
+    row_height,
     short,
 )
-from lerobot_roborecover.analysis.summary import Estimate
-from lerobot_roborecover.analysis.tables import NOT_DEFINED
-
-_ROW = 0.34
-"""Height of a row of a plot with one row per item, inches."""
 
 
 def all_figures(results: Results) -> list[Figure]:
     """Every figure that the study has something for."""
     figures = [forest(results)]
+    if results.several_runs:
+        figures.append(runs_figure(results))
     several = len(results.recovery.arms) > 1
     if len(results.matched) > 1:
         figures.append(rank_transition(results))
@@ -53,30 +59,46 @@ def all_figures(results: Results) -> list[Figure]:
 
 
 def forest(results: Results) -> Figure:
-    """RSR with intervals, best first; initial-state rates as hollow markers."""
-    panel = results.recovery
-    rsr, initial = results.draws.estimates(panel.rates.T), initial_estimates(results)
-    order = sorted(range(len(rsr)), key=lambda p: (rsr[p].value, panel.arms[p]))
-    with drawing() as subplots:
-        plot, axes = subplots(7.2, 1.1 + _ROW * len(order))
-        for y, p in enumerate(order):
-            if not math.isnan(rsr[p].low):
-                axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=colour(p), lw=2)
-            axes.plot(100 * rsr[p].value, y, marker(p), color=colour(p), ms=8)
-            if not math.isnan(initial[p].value):
-                axes.plot(100 * initial[p].value, y, "|", color=INK, ms=12, mew=2)
-            axes.annotate(
-                f"{100 * rsr[p].value:.1f}", (100 * rsr[p].value, y), (0, 7), textcoords="offset points",
-                ha="center", fontsize=8, color=INK,
-            )  # fmt: skip
-        axes.set(
-            yticks=range(len(order)), yticklabels=[short(panel.arms[p]) for p in order], xlim=(-2, 102),
-            ylim=(-0.6, len(order) - 0.25),
-            xlabel=f"RSR with {100 * results.draws.level:g} % interval, %; upright bar: from initial states",
-        )  # fmt: skip
-        axes.grid(axis="x", color=LINE, lw=0.6)
+    """RSR with intervals, best first; initial-state rates as hollow markers with theirs."""
+    panel, chosen = results.recovery, results.compared.policies
+    rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
+    order = [chosen[p] for p in reversed(results.best_first)]
+    level = f"{100 * results.draws.level:g} % interval"
+
+    def draw(width: Width) -> Any:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.8 + row_height(width, 0.46) * len(order))
+            for y, p in enumerate(order):
+                if not math.isnan(initial[p].value):
+                    at = y - 0.2
+                    if not math.isnan(initial[p].low):
+                        axes.plot([100 * initial[p].low, 100 * initial[p].high], [at, at], color=SOFT, lw=1.2)
+                    axes.plot(100 * initial[p].value, at, "o", color=SOFT, mfc=PAPER, ms=5.5)
+                if not math.isnan(rsr[p].low):
+                    axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=colour(p), lw=3)
+                axes.plot(100 * rsr[p].value, y, marker(p), color=colour(p), ms=9, mec=PAPER, mew=1)
+                value = f"{100 * rsr[p].value:.1f}"
+                if width.narrow:
+                    place = {"xycoords": ("axes fraction", "data"), "ha": "right"}
+                    axes.annotate(value, (1, y), (0, 9), textcoords="offset points", fontsize=9.5, **place)
+                else:
+                    at = 100 * rsr[p].value, y
+                    axes.annotate(value, at, (0, 8), textcoords="offset points", ha="center", fontsize=9)
+            name_rows(axes, [short(panel.arms[p], width.names) for p in order], width)
+            axes.set(xlim=(-1, 101), ylim=(-0.6, len(order) - 0.15))
+            hollow = any(not math.isnan(e.value) for e in initial)
+            texts = [f"RSR, %, with {level}", "hollow: from initial states"][: 1 + hollow]
+            axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
+            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.set_axisbelow(True)
+            axes.spines["left"].set_visible(False)
+        return plot
+
     words = "; ".join(f"{panel.arms[p]} {_words(rsr[p])}" for p in reversed(order))
-    return Figure("forest", "Recovery success rate", f"RSR in per cent, best first: {words}.", plot)
+    text = f"RSR in per cent, best first: {words}."
+    if results.left_out:
+        text += f" Not ranked, because not run on all scenarios: {', '.join(results.left_out)}."
+    return Figure("forest", "Recovery success rate", text, *both(draw))
 
 
 def _words(estimate: Estimate) -> str:
@@ -88,25 +110,31 @@ def _words(estimate: Estimate) -> str:
 def rank_transition(results: Results) -> Figure:
     """Ranks from initial states against ranks at recovery."""
     index = results.matched
-    names = [results.recovery.arms[p] for p in index]
-    initial = masked_mean(results.initial_rates[index].T)
-    recovery = masked_mean(results.recovery.rates[index].T)
+    initial_rates, recovery_rates, names, _ = results.both_starts
+    initial, recovery = masked_mean(initial_rates.T), masked_mean(recovery_rates.T)
     left, right = _ranks(initial), _ranks(recovery)
-    with drawing() as subplots:
-        plot, axes = subplots(7.2, 1.0 + 0.42 * len(index))
-        for k, p in enumerate(index):
-            axes.plot([0, 1], [left[k], right[k]], marker(p), ls="-", color=colour(p), lw=2, ms=8)
-            axes.text(-0.08, left[k], f"{short(names[k])}  {100 * initial[k]:.1f}", ha="right", va="center")
-            axes.text(1.08, right[k], f"{100 * recovery[k]:.1f}  {short(names[k])}", ha="left", va="center")
-        axes.set(
-            xlim=(-0.9, 1.9), ylim=(len(index) + 0.6, 0.4), xticks=[0, 1],
-            xticklabels=["initial state", "recovery"], yticks=[],
-        )  # fmt: skip
-        axes.spines[:].set_visible(False)
-        axes.tick_params(length=0, labelcolor=INK)
+
+    def draw(width: Width) -> Any:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.7 + 0.42 * len(index))
+            for k, p in enumerate(index):
+                axes.plot([0, 1], [left[k], right[k]], marker(p), ls="-", color=colour(p), lw=2.2, ms=8.5)
+                name = short(names[k], 12 if width.narrow else width.names)
+                gap = 0.1 if width.narrow else 0.04
+                before = f"{100 * initial[k]:.1f}" if width.narrow else f"{name}   {100 * initial[k]:.1f}"
+                axes.text(-gap, left[k], before, ha="right", va="center")
+                axes.text(1 + gap, right[k], f"{100 * recovery[k]:.1f}   {name}", ha="left", va="center")
+            axes.set(
+                xlim=(-0.45, 1.95) if width.narrow else (-0.75, 1.75), ylim=(len(index) + 0.5, 0.5),
+                xticks=[0, 1], xticklabels=["initial state, %", "recovery, %"], yticks=[],
+            )  # fmt: skip
+            axes.spines[:].set_visible(False)
+            axes.tick_params(length=0, labelcolor=SOFT)
+        return plot
+
     order = ", ".join(names[k] for k in np.argsort(left)), ", ".join(names[k] for k in np.argsort(right))
     text = f"Order from initial states: {order[0]}. Order at recovery: {order[1]}."
-    return Figure("rank_transition", "From initial-state rank to recovery rank", text, plot)
+    return Figure("rank_transition", "From initial-state rank to recovery rank", text, *both(draw))
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
@@ -122,13 +150,13 @@ def cell_heat_map(results: Results) -> Figure:
     labels = [f"{g.label.replace('-', ', ', 1)}  (N={g.scenarios})" for g in groups]
     values = np.array([[e.value for e in g.estimates] for g in groups])
     sparse = [g.underpowered for g in groups]
-    plot = _heat_map(values, labels, results.recovery.arms, sparse)
+    plots = _heat_map(values, labels, results.recovery.arms, sparse)
     words = "; ".join(
         f"{label}: "
         f"{', '.join(f'{a} {number(100 * v)}' for a, v in zip(results.recovery.arms, row, strict=True))}"
         for label, row in zip(labels, values, strict=True)
     )
-    return Figure("cells", "Recovery by stage and deviation type", f"RSR in per cent. {words}.", plot)
+    return Figure("cells", "Recovery by stage and deviation type", f"RSR in per cent. {words}.", *plots)
 
 
 def source_heat_map(results: Results, matrix: Sequence) -> Figure:
@@ -137,7 +165,8 @@ def source_heat_map(results: Results, matrix: Sequence) -> Figure:
     values = np.array([[e.value for e in row.rates] for row in matrix])
     solid = [(i, row.own) for i, row in enumerate(matrix) if row.own is not None]
     dashed = [(i, row.best_other) for i, row in enumerate(matrix) if row.best_other is not None]
-    plot = _heat_map(values, labels, results.recovery.arms, [r.underpowered for r in matrix], solid, dashed)
+    sparse = [row.underpowered for row in matrix]
+    plots = _heat_map(values, labels, results.recovery.arms, sparse, solid, dashed)
     words = "; ".join(
         f"scenarios of {row.source_policy}: best other {results.recovery.arms[row.best_other]} "
         f"{number(100 * row.rates[row.best_other].value)}"
@@ -146,7 +175,7 @@ def source_heat_map(results: Results, matrix: Sequence) -> Figure:
         if row.best_other is not None
     )
     text = f"RSR in per cent; solid outline: the source policy itself, dashed: observed best other. {words}"
-    return Figure("source_matrix", "Who recovers from whose deviations", text, plot)
+    return Figure("source_matrix", "Who recovers from whose deviations", text, *plots)
 
 
 def _heat_map(
@@ -156,80 +185,84 @@ def _heat_map(
     sparse: Sequence[bool],
     solid: Sequence[tuple[int, int]] = (),
     dashed: Sequence[tuple[int, int]] = (),
-):
+) -> tuple[Any, Any]:
+    """Rows × policies as coloured fields with their numbers, wide and narrow."""
+    from matplotlib import colormaps
     from matplotlib.patches import Rectangle
 
-    with drawing() as subplots:
-        plot, axes = subplots(max(5.0, 2.6 + 0.95 * len(policies)), 1.3 + 0.42 * len(labels))
-        alpha = np.where(np.array(sparse)[:, None], 0.45, 1.0) * np.ones_like(values)
-        image = axes.imshow(100 * values, cmap=HEAT, vmin=0, vmax=100, aspect="auto", alpha=alpha)
-        for i in range(values.shape[0]):
-            for j in range(values.shape[1]):
-                dark = values[i, j] < 0.55 and not sparse[i]
-                text = number(100 * values[i, j])
-                axes.text(
-                    j,
-                    i,
-                    text,
-                    ha="center",
-                    va="center",
-                    color="white" if dark and text != NOT_DEFINED else INK,
-                )
-            if sparse[i]:
-                axes.add_patch(
-                    Rectangle(
-                        (-0.5, i - 0.5), len(policies), 1, fill=False, hatch="....", ec=SOFT, lw=0, alpha=0.5
-                    )
-                )
-        for cells, style in ((dashed, (0, (4, 2))), (solid, "-")):
-            for i, j in cells:
-                axes.add_patch(Rectangle((j - 0.44, i - 0.42), 0.88, 0.84, fill=False, ec="white", lw=4))
-                axes.add_patch(
-                    Rectangle((j - 0.44, i - 0.42), 0.88, 0.84, fill=False, ec="#d55e00", lw=2, ls=style)
-                )
-        axes.set_xticks(
-            range(len(policies)),
-            [short(p, 20) for p in policies],
-            rotation=30,
-            ha="right",
-            rotation_mode="anchor",
-        )
-        axes.set_yticks(range(len(labels)), labels)
-        axes.tick_params(length=0, labelcolor=INK)
-        axes.spines[:].set_visible(False)
-        plot.colorbar(image, ax=axes, label="RSR, %", shrink=0.9)
-    return plot
+    shades = colormaps[HEAT]
+
+    def draw(width: Width) -> Any:
+        with drawing() as subplots:
+            tall = row_height(width, 0.44)
+            plot, axes = subplots(width.inches, 0.9 + tall * len(labels) + 0.25 * width.narrow)
+            for i, j in np.ndindex(values.shape):
+                known = math.isfinite(values[i, j])
+                low = 0.16 if width.narrow else 0.46
+                field = Rectangle(
+                    (j - 0.48, i - low), 0.96, low + 0.46, fc=shades(values[i, j]) if known else "none",
+                    ec=LINE if not known or sparse[i] else "none", lw=0.8, alpha=0.55 if sparse[i] else 1,
+                    hatch="...." if sparse[i] and known else None,
+                )  # fmt: skip
+                axes.add_patch(field)
+                dark = known and values[i, j] < 0.55
+                text = axes.text(
+                    j, i + (0.46 - low) / 2, number(100 * values[i, j]), ha="center", va="center",
+                    color=ON_COLOUR if dark else ON_LIGHT if known else SOFT,
+                )  # fmt: skip
+                if sparse[i] and known:
+                    text.set_bbox({"fc": shades(values[i, j]), "ec": "none", "pad": 1.5})
+            for cells, style in ((dashed, (0, (4, 2))), (solid, "-")):
+                for i, j in cells:
+                    low = 0.12 if width.narrow else 0.42
+                    corner, size = (j - 0.44, i - low), (0.88, low + 0.42)
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec=ON_COLOUR, lw=4))
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec="#d55e00", lw=2, ls=style))
+            tilt = {"rotation": 30, "ha": "left", "rotation_mode": "anchor"} if width.narrow else {}
+            limit = 14 if width.narrow else max(8, int(120 / len(policies)))
+            axes.set_xticks(range(len(policies)), [short(p, limit) for p in policies], **tilt)
+            axes.xaxis.tick_top()
+            if width.narrow:
+                axes.set_yticks([])
+                for i, label in enumerate(labels):
+                    axes.text(-0.48, i - 0.22, label, va="bottom", fontsize=9.5)
+            else:
+                axes.set_yticks(range(len(labels)), labels)
+            axes.set(xlim=(-0.5, len(policies) - 0.5), ylim=(len(labels) - 0.5, -0.62))
+            axes.tick_params(length=0, labelcolor=INK)
+            axes.spines[:].set_visible(False)
+        return plot
+
+    return both(draw)
 
 
 def paired_differences(results: Results) -> Figure:
     """All pairs with their intervals; separated ones filled."""
-    found = sorted(
-        contrasts(results.recovery.rates, results.recovery.arms, results.draws),
-        key=lambda c: c.difference.value,
-    )
+    found = sorted(results.contrasts, key=lambda c: c.difference.value)
     shown = [c for c in found if not math.isnan(c.difference.value)]
-    with drawing() as subplots:
-        plot, axes = subplots(7.2, 1.1 + 0.27 * max(1, len(shown)))
-        axes.axvline(0, color=SOFT, lw=1)
-        for y, c in enumerate(shown):
-            d = c.difference
-            clear = d.low > 0 or d.high < 0
-            if not math.isnan(d.low):
-                axes.plot([100 * d.low, 100 * d.high], [y, y], color=colour(0) if clear else SOFT, lw=2)
-            axes.plot(
-                100 * d.value,
-                y,
-                "o",
-                color=colour(0) if clear else SOFT,
-                mfc=colour(0) if clear else "white",
-                ms=7,
-            )
-        axes.set(
-            yticks=range(len(shown)), yticklabels=[f"{short(c.a, 20)} − {short(c.b, 20)}" for c in shown],
-            ylim=(-0.7, max(1, len(shown)) - 0.3),
-            xlabel=f"RSR, A − B, points, {100 * results.draws.level:g} % interval (filled: without zero)",
-        )  # fmt: skip
-        axes.grid(axis="x", color=LINE, lw=0.6)
-    clear = [c for c in shown if c.difference.low > 0 or c.difference.high < 0]
-    text = f"{len(clear)} of {len(shown)} pairs are separated before adjustment for their number."
-    return Figure("paired_differences", "Paired differences in RSR", text, plot)
+    level = f"{100 * results.draws.level:g} % interval"
+
+    def draw(width: Width) -> Any:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.9 + row_height(width, 0.3) * max(1, len(shown)))
+            axes.axvline(0, color=SOFT, lw=1)
+            for y, c in enumerate(shown):
+                d = c.difference
+                clear = c.verdict.separated
+                shade = colour(0) if clear else SOFT
+                if not math.isnan(d.low):
+                    axes.plot([100 * d.low, 100 * d.high], [y, y], color=shade, lw=2.2)
+                axes.plot(100 * d.value, y, "o", color=shade, mfc=shade if clear else PAPER, ms=7)
+            limit = 15 if width.narrow else 22
+            name_rows(axes, [f"{short(c.a, limit)} − {short(c.b, limit)}" for c in shown], width)
+            axes.set(ylim=(-0.7, max(1, len(shown)) - (0.1 if width.narrow else 0.3)))
+            texts = f"RSR, A − B, points, with {level}", "filled: separated (Holm)"
+            axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
+            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.set_axisbelow(True)
+            axes.spines["left"].set_visible(False)
+        return plot
+
+    clear = [c for c in shown if c.verdict.separated]
+    text = f"{len(clear)} of {len(shown)} pairs are separated after adjustment for their number (Holm)."
+    return Figure("paired_differences", "Paired differences in RSR", text, *both(draw))

@@ -35,6 +35,8 @@ class PolicyMarks:
     """One sign a trial, in their order."""
     words: str
     """The same for readers without the signs."""
+    initial: str = ""
+    """Signs of the trials from the initial state; empty where there are none."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,21 @@ class Card:
     """Mean of the policies' rates."""
 
 
-def make_cards(panel: Panel, frames: Mapping[str, bytes], clips: Mapping[str, Sequence[Clip]]) -> list[Card]:
+def make_cards(
+    panel: Panel,
+    frames: Mapping[str, bytes],
+    clips: Mapping[str, Sequence[Clip]],
+    initial: Panel | None = None,
+) -> list[Card]:
     """Cards of all scenarios, those on which policies disagree most first.
 
     Args:
         panel: trials from recovery points.
         frames: PNG or JPEG files by scenario id.
         clips: videos by scenario id.
+        initial: trials of the same policies from initial states.
     """
+    before = _initial_rows(initial)
     cards = []
     for n, scenario in enumerate(panel.scenarios):
         rates = panel.rates[:, n]
@@ -91,8 +100,13 @@ def make_cards(panel: Panel, frames: Mapping[str, bytes], clips: Mapping[str, Se
                 source_policy=scenario.source_policy,
                 frame=_image_uri(frames[scenario.id]) if scenario.id in frames else "",
                 marks=tuple(
-                    _marks(policy, panel.rows.get((p, n), ()), int(panel.trials[p, n]))
-                    for p, policy in enumerate(panel.arms)
+                    _marks(
+                        panel.arms[p],
+                        panel.rows.get((p, n), ()),
+                        int(panel.trials[p, n]),
+                        before.get((panel.arms[p], scenario.id), ()),
+                    )
+                    for p in range(len(panel.arms))
                 ),
                 clips=tuple(clips.get(scenario.id, ())),
                 outcome_classes=_classes(run, bool(panel.invalid[:, n].any())),
@@ -109,19 +123,37 @@ def _classes(rates: np.ndarray, invalid: bool) -> tuple[str, ...]:
     return (kind, "invalid") if invalid else (kind,)
 
 
-def _marks(policy: str, rows: Sequence[TrialRow], scheduled: int) -> PolicyMarks:
+def _initial_rows(panel: Panel | None) -> dict[tuple[str, str], Sequence[TrialRow]]:
+    """Rows from initial states by policy and scenario id."""
+    if panel is None:
+        return {}
+    return {(panel.arms[p], panel.scenarios[n].id): rows for (p, n), rows in panel.rows.items()}
+
+
+_VALID = frozenset(outcome.value for outcome in Outcome if outcome.valid)
+
+
+def _kinds(rows: Sequence[TrialRow]) -> list[str]:
+    return ["success" if r.success else "failure" if r.outcome in _VALID else "invalid" for r in rows]
+
+
+def _marks(policy: str, rows: Sequence[TrialRow], scheduled: int, initial: Sequence[TrialRow]) -> PolicyMarks:
+    before = _kinds(initial)
+    from_start = f"; from the initial state {before.count('success')} of {len(before)}" if before else ""
+    signs = "".join(SIGNS[kind] for kind in before)
     if not scheduled:
-        return PolicyMarks(policy, "", "not run")
-    kinds = ["success" if r.success else "failure" if Outcome(r.outcome).valid else "invalid" for r in rows]
+        return PolicyMarks(policy, "", f"not run{from_start}", signs)
+    kinds = _kinds(rows)
     missing = scheduled - len(rows)
     words = f"solved {kinds.count('success')} of {scheduled} trials"
     if missing:
         words += f", {missing} without a row"
     for row in rows:
-        if not Outcome(row.outcome).valid:
+        if row.outcome not in _VALID:
             why = f", {row.reason}" if row.reason else ""
             words += f"; trial {row.trial}: {row.outcome.replace('_', ' ')}{why}"
-    return PolicyMarks(policy, "".join(SIGNS[k] for k in kinds) + "–" * missing, words)
+    shown = "".join(SIGNS[kind] for kind in kinds) + "–" * missing
+    return PolicyMarks(policy, shown, words + from_start, signs)
 
 
 def _image_uri(data: bytes) -> str:

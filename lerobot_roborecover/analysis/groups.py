@@ -1,4 +1,4 @@
-"""Rates within groups of scenarios, Macro, ratios, and what the best of all policies would reach."""
+"""Rates within groups of scenarios, Macro, and whose deviations who recovers from."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_roborecover.analysis.crossfit import gain_over
+from lerobot_roborecover.analysis.intervals import Estimate, clean
 from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.resampling import Resampling, masked_mean, resample
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW, Estimate
+from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
+from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,12 @@ class Group:
 def group_rates(
     panel: Panel, label: str, resampling: Resampling, keep: np.ndarray | None = None
 ) -> list[Group]:
-    """Rates by group, resampled within the group.
+    """Rates by group, with intervals over the group's own scenarios.
 
     Args:
         panel: the trials.
         label: field of the scenarios: `cell`, `source`, `suite`, `source_policy`, `task`.
-        resampling: gives draws, seed and level.
+        resampling: of the panel's scenarios.
         keep: (N,) bool: scenarios to look at; by default all.
     """
     labels = panel.labels(label)
@@ -45,13 +47,27 @@ def group_rates(
         index = np.flatnonzero((labels == name) & keep)
         if not len(index):
             continue
-        own = resample(panel.units()[index], len(resampling.weights), resampling.seed, resampling.level)
-        groups.append(Group(name, len(index), tuple(own.estimates(panel.rates[:, index].T))))
+        own = resampling.part(index)
+        groups.append(Group(name, len(index), tuple(own.rates(panel.rates[:, index].T))))
     return groups
 
 
 def macro_estimates(panel: Panel, resampling: Resampling) -> list[Estimate]:
-    """Macro RSR of every policy: the mean over occupied cells of the cell's mean rate.
+    """Macro RSR of every policy: the mean over the panel's cells of the cell's mean rate.
+
+    NaN for a policy without a trial in one of the cells: a mean over fewer is another number.
+    """
+    labels = panel.labels("cell")
+    cells = set(labels.tolist())
+    estimates = resampling.rates(panel.rates.T, cells=labels)
+    return [
+        e if set(labels[np.isfinite(rates)].tolist()) == cells else Estimate(np.nan, np.nan, np.nan)
+        for e, rates in zip(estimates, panel.rates, strict=True)
+    ]
+
+
+def percentile_macro(panel: Panel, resampling: Resampling) -> list[Estimate]:
+    """The paper's percentile bootstrap of Macro RSR, to compare with the paper.
 
     A draw that leaves a cell empty averages the others, as `estimators.bootstrap_interval` does.
     """
@@ -63,7 +79,7 @@ def macro_estimates(panel: Panel, resampling: Resampling) -> list[Estimate]:
     draws = resampling.means(values).reshape(-1, policies, len(cells))
     low, high = resampling.interval(_mean_of_known(draws))
     return [
-        Estimate(float(v), float(a), float(b))
+        Estimate(float(v), float(clean(a)), float(clean(b)))
         for v, a, b in zip(_mean_of_known(points), low, high, strict=True)
     ]
 
@@ -72,54 +88,6 @@ def _mean_of_known(values: np.ndarray) -> np.ndarray:
     known = np.isfinite(values)
     total, count = np.where(known, values, 0).sum(-1), known.sum(-1)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def ratio_estimates(numerator: np.ndarray, denominator: np.ndarray, resampling: Resampling) -> list[Estimate]:
-    """Ratios of two mean rates on the scenarios that have both, e.g. retention: recovery over initial.
-
-    Args:
-        numerator: (P, N) rates; NaN where not run.
-        denominator: (P, N) rates.
-        resampling: of the N scenarios.
-
-    Returns:
-        P estimates; NaN where the denominator is zero.
-    """
-    both = np.isfinite(numerator) & np.isfinite(denominator)
-    top, bottom = np.where(both, numerator, np.nan).T, np.where(both, denominator, np.nan).T
-    low, high = resampling.interval(_quotient(resampling.means(top), resampling.means(bottom)))
-    points = _quotient(masked_mean(top), masked_mean(bottom))
-    return [Estimate(float(v), float(a), float(b)) for v, a, b in zip(points, low, high, strict=True)]
-
-
-def _quotient(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
-    return np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0)
-
-
-@dataclass(frozen=True)
-class Oracle:
-    """The highest observed rate of any policy, scenario by scenario: optimistic and not deployable."""
-
-    rate: Estimate
-    best_policy: str
-    best_rate: Estimate
-    gain: Estimate
-    """Oracle minus best fixed policy, on the same draws."""
-    no_success: tuple[str, ...]
-    """Scenarios that no policy ever solved."""
-    scenarios: int
-
-
-def oracle(panel: Panel, resampling: Resampling) -> Oracle:
-    """Retrospective oracle over all policies of a panel with at least one trial somewhere."""
-    known = np.isfinite(panel.rates)
-    highest = np.where(known, panel.rates, -1.0).max(0)
-    means = masked_mean(panel.rates.T)
-    best = int(np.nanargmax(means))
-    columns = np.stack([highest, panel.rates[best], highest - panel.rates[best]], 1)
-    rate, best_rate, gain = resampling.estimates(columns)
-    lost = tuple(s.id for s, total in zip(panel.scenarios, panel.successes.sum(0), strict=True) if not total)
-    return Oracle(rate, panel.arms[best], best_rate, gain, lost, len(panel.scenarios))
 
 
 @dataclass(frozen=True)
@@ -135,7 +103,10 @@ class SourceRow:
     best_other: int | None
     """Index of the observed-best alternative; None where there is no alternative."""
     gain: Estimate | None
-    """Observed-best alternative minus the source policy itself. The best is chosen once, on all scenarios."""
+    """Best alternative minus the source policy itself, the best chosen on half of the trials (of the
+    scenarios, where trials are single) and scored on the other half; None where one of the two is missing."""
+    hindsight_gain: float
+    """The observed best chosen and scored on the same trials, and so too high; NaN where one is missing."""
 
     @property
     def underpowered(self) -> bool:
@@ -154,11 +125,12 @@ def source_matrix(panel: Panel, resampling: Resampling) -> list[SourceRow]:
         values = np.array([e.value for e in group.estimates])
         others = [p for p in range(len(values)) if p != own and np.isfinite(values[p])]
         best = max(others, key=lambda p: values[p]) if others else None
-        gain = None
+        gain, hindsight = None, float("nan")
         if own is not None and best is not None:
-            part = resample(panel.units()[index], len(resampling.weights), resampling.seed, resampling.level)
-            (gain,) = part.estimates((panel.rates[best, index] - panel.rates[own, index])[:, None])
-        rows.append(SourceRow(group.label, group.scenarios, group.estimates, own, best, gain))
+            part = resampling.part(index)
+            gain = gain_over(panel.successes[:, index], panel.trials[:, index], own, others, part)
+            hindsight = float(values[best] - values[own])
+        rows.append(SourceRow(group.label, group.scenarios, group.estimates, own, best, gain, hindsight))
     return rows
 
 

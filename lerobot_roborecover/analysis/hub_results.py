@@ -10,8 +10,8 @@ import math
 import re
 
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard
-from lerobot_roborecover.analysis.summary import Estimate
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}")
 

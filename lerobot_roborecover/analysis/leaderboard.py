@@ -1,26 +1,35 @@
 """A leaderboard from many trial logs: one board per set-up that may be compared, provenance in every row.
 
-Logs on one board share platform, scenario set and simulator versions. A log that cannot be read is listed
-with its reason; it never takes the others down.
+Logs on one board share platform, simulator versions and the scenario set, which is known by the hashes of its
+scenarios' content: a log with one scenario more or another is of another set, and gets a board of its own. A
+log of a part of a set is an incomplete entry of the board of that set, unless more policies were run on
+exactly that part than on the whole. A log that cannot be read is listed with its reason; it never takes the
+others down.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis import published
+from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.groups import macro_estimates
-from lerobot_roborecover.analysis.logs import Arm, check_row
+from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
+from lerobot_roborecover.analysis.logs import Arm, arm_of, stopped
+from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.runs import method_rate, run_rates
+from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.analysis.units import WORDS
+from lerobot_roborecover.analysis.verdicts import Verdict
 from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, read_trial_log
 from lerobot_roborecover.scenario import Start
 
@@ -55,13 +64,26 @@ class Entry:
     macro: Estimate
     initial: Estimate
     behind: Estimate
-    """Best complete entry of the board minus this one, on common scenarios and the same draws."""
+    """Best complete entry of the board minus this one, on common scenarios."""
+    verdict: Verdict | None
+    """Of the best against this one, by Holm's p within the board; None for the best itself and for what is
+    not ranked."""
+    place: tuple[int, int] | None
+    """Best and worst rank that the verdicts leave open; None for what is not ranked."""
     scenarios: int
     trials: int
     invalid: int
     interventions: bool
     """Whether anything but the policy acted; such rows are no entries of the policy comparison."""
     provenance: Provenance
+    runs: int = 1
+    """Runs of the method, where it has several."""
+    other_runs: Estimate = UNDEFINED
+    """RSR with the interval for other runs like these; undefined with one run."""
+    run_sd: float = _NAN
+    """SD between the runs' rates."""
+    stopped: bool = False
+    """Whether its run ended when a sequential comparison was decided; it has no rank."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +92,15 @@ class Board:
 
     platform: str
     dataset: str
+    scenario_set: str
+    """First 12 digits of the SHA-256 of its scenarios' ids and content hashes."""
     scenarios: int
-    """In the union of its entries; an entry with fewer is incomplete."""
+    """In the set; an entry with fewer is incomplete."""
     simulators: dict[str, str]
     entries: tuple[Entry, ...]
     options: Options
+    unit: str
+    """What intervals and tests take as independent, in words."""
 
 
 @dataclass(frozen=True)
@@ -86,20 +112,28 @@ class Leaderboard:
     """File name and reason."""
 
 
-def make_leaderboard(folder: Path, options: Options | None = None) -> Leaderboard:
+def make_leaderboard(
+    folder: Path, options: Options | None = None, methods: Sequence[str] = ()
+) -> Leaderboard:
     """Reads every `.jsonl` below a folder.
 
     Args:
         folder: where the logs are, at any depth.
         options: draws, seed, level, scheduled trials.
+        methods: `METHOD=LOG,LOG,...` each: logs below the folder, or folders of them, that are the runs of
+            one method and make one entry.
 
     Raises:
-        RowsError: the folder does not exist, or holds no log at all.
+        RowsError: the folder does not exist, or holds no log at all; or a method's log is not there.
     """
     options = options or Options()
     files = sorted(folder.rglob("*.jsonl")) if folder.is_dir() else []
     if not files:
         raise RowsError(f"no trial logs (*.jsonl) below {folder}")
+    run_of_file = _methods(folder, files, methods)
+    records: list[SequentialRecord] = []
+    run_of: dict[int, str] = {}
+    """Names of the runs of methods, by the identity of a row."""
     refused: list[tuple[str, str]] = []
     groups: dict[tuple, dict[tuple, dict[tuple, tuple[TrialRow, str]]]] = {}
     contradicted: dict[tuple, str] = {}
@@ -108,20 +142,22 @@ def make_leaderboard(folder: Path, options: Options | None = None) -> Leaderboar
         name = str(path.relative_to(folder))
         try:
             rows = read_trial_log(path)
-            for row in rows:
-                check_row(row, path)
-        except TrialLogError as err:
+            if (record := read_record(path)) is not None:
+                records.append(record)
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+        except (TrialLogError, OSError) as err:
             refused.append((name, str(err)))
             continue
         if not rows:
             refused.append((name, "it holds no complete row"))
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+        method, run = run_of_file.get(path, ("", ""))
         for row in rows:
-            key = _board_key(row), _entry_key(row)
+            run_of[id(row)] = run
+            key = _board_key(row), _entry_key(row, method)
             other, first = (
                 groups.setdefault(key[0], {})
                 .setdefault(key[1], {})
-                .setdefault((row.start, row.rewind_steps, *row.key()), (row, name))
+                .setdefault((run, row.start, row.rewind_steps, *row.key()), (row, name))
             )
             if (other.outcome, other.steps) != (row.outcome, row.steps):
                 contradicted.setdefault(
@@ -133,13 +169,20 @@ def make_leaderboard(folder: Path, options: Options | None = None) -> Leaderboar
         del groups[board][entry]
     boards = []
     for key, entries in groups.items():
-        try:
-            rows_of = {e: [row for row, _ in found.values()] for e, found in entries.items()}
-            boards.append(_board(key, rows_of, logs, options))
-        except RowsError as err:
-            refused.append((f"{key[0]}, {key[1]}", str(err)))
-    boards = [b for b in boards if b.entries]
-    boards.sort(key=lambda b: (b.platform, b.dataset, sorted(b.simulators.items())))
+        rows_of = {e: [row for row, _ in found.values()] for e, found in entries.items()}
+        usable = {e: rows for e, rows in rows_of.items() if any(r.start == Start.RECOVERY for r in rows)}
+        if rows_of and not usable:
+            refused.append((f"{key[0]}, {key[1]}", "no trials from recovery points"))
+        for scenario_set, members in _sets(usable).items():
+            try:
+                boards.append(
+                    _board(key, scenario_set, {e: usable[e] for e in members}, logs, options, run_of, records)
+                )
+            except RowsError as err:
+                refused.append((f"{key[0]}, {key[1]}", str(err)))
+    boards.sort(
+        key=lambda b: (b.platform, b.dataset, sorted(b.simulators.items()), -len(b.entries), b.scenario_set)
+    )
     return Leaderboard(tuple(boards), tuple(dict.fromkeys(refused)))
 
 
@@ -151,70 +194,142 @@ def _board_key(row: TrialRow) -> tuple:
     return row.platform, f"{row.dataset}{revision}", row.split, simulators, kind
 
 
-def _entry_key(row: TrialRow) -> tuple:
-    return row.policy, row.run_seed, row.execution_horizon, repr(sorted(row.options.items(), key=str))
+def _entry_key(row: TrialRow, method: str) -> tuple:
+    who = (method, None) if method else (row.policy, row.run_seed)
+    return *who, row.execution_horizon, repr(sorted(row.options.items(), key=str))
 
 
-def _board(key: tuple, entries: dict[tuple, list[TrialRow]], logs: dict, options: Options) -> Board:
+def _methods(folder: Path, files: Sequence[Path], methods: Sequence[str]) -> dict[Path, tuple[str, str]]:
+    """Method and run of every log that belongs to one."""
+    found: dict[Path, tuple[str, str]] = {}
+    for text in methods:
+        name, rest = split_named(text)
+        if not name:
+            raise RowsError(f"--method {text}: no name. Write METHOD=LOG,LOG")
+        for part in rest.split(","):
+            inside = [f for f in files if f == folder / part or (folder / part) in f.parents]
+            if not inside:
+                raise RowsError(f"--method {text}: {part}: no such log below {folder}")
+            for file in inside:
+                other = found.setdefault(file, (name, part))
+                if other != (name, part):
+                    raise RowsError(f"--method {text}: {file} is {other[1]} of {other[0]} already")
+    return found
+
+
+type _Set = frozenset[tuple[str, str]]
+"""Ids and content hashes of scenarios."""
+
+
+def _sets(entries: dict[tuple, list[TrialRow]]) -> dict[_Set, list[tuple]]:
+    """Entries by the scenario set of their board."""
+    own: dict[_Set, list[tuple]] = {}
+    for entry, rows in entries.items():
+        run = frozenset((r.scenario_id, r.scenario_sha256) for r in rows if r.start == Start.RECOVERY)
+        own.setdefault(run, []).append(entry)
+    boards: dict[_Set, list[tuple]] = {}
+    for run, members in own.items():
+        wholes = [w for w in own if run < w and len(own[w]) >= len(members)]
+        home = max(wholes, key=lambda w: (len(own[w]), len(w), sorted(w)), default=run)
+        boards.setdefault(home, []).extend(members)
+    # What took in a part may itself be part of another: its entries follow it.
+    for home in sorted(boards, key=len):
+        wholes = [w for w in boards if home < w and home not in own]
+        if wholes:
+            boards[max(wholes, key=len)] += boards.pop(home)
+    return boards
+
+
+def _board(
+    key: tuple,
+    scenario_set: _Set,
+    usable: dict[tuple, list[TrialRow]],
+    logs: dict,
+    options: Options,
+    run_of: dict[int, str],
+    records: Sequence[SequentialRecord],
+) -> Board:
     platform, dataset, split, simulators, kind = key
-    usable = {e: rows for e, rows in entries.items() if any(r.start == Start.RECOVERY for r in rows)}
-    name = f"{dataset}, {split}{kind}"
-    if not usable:
-        raise RowsError("no trials from recovery points")
-    arms = [_arm(e, rows, Start.RECOVERY) for e, rows in usable.items()]
+    arms = list(stopped([_arm(e, rows, Start.RECOVERY, run_of) for e, rows in usable.items()], records))
     panel = make_panel(arms, options.scheduled)
-    _same_scenarios(arms)
-    draws = resample(panel.units(), options.draws, options.seed, options.level)
-    rsr, macro = draws.estimates(panel.rates.T), macro_estimates(panel, draws)
+    unit = panel.unit(options.cluster)
+    draws = resample(panel.units(unit), options.draws, options.seed, options.level)
+    rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
     run = (panel.trials > 0).sum(1)
-    complete = [p for p in range(len(arms)) if run[p] == len(panel.scenarios)]
     acting = [any(r.interventions for r in arm.rows) for arm in arms]
-    rivals = [p for p in complete if not acting[p]] or complete
-    best = max(rivals, key=lambda p: rsr[p].value) if rivals else None
-    behind = (
-        draws.estimates((panel.rates[best] - panel.rates).T)
-        if best is not None
-        else [_undefined()] * len(arms)
-    )
-    found = []
+    ranked = [
+        p
+        for p, arm in enumerate(arms)
+        if run[p] == len(panel.scenarios) and not acting[p] and not arm.unreached
+    ]
+    methods = [method_rate(run_rates(a, panel, p, options.scheduled), draws) for p, a in enumerate(arms)]
+    best = max(ranked, key=lambda p: rsr[p].value) if ranked else None
+    behind = [_undefined()] * len(arms)
+    if best is not None:
+        behind = draws.differences((panel.rates[best] - panel.rates).T)
+    found = contrasts(panel.rates, panel.arms, draws, list(combinations(ranked, 2)), unit=WORDS[unit])
+    between = dict(zip(combinations(ranked, 2), found, strict=True))
+    entries = []
     for p, (e, rows) in enumerate(usable.items()):
         initial = [r for r in rows if r.start == Start.INITIAL]
-        found.append(
+        against = between.get((best, p)) or between.get((p, best)) if best is not None else None
+        entries.append(
             Entry(
                 policy=e[0],
                 rsr=rsr[p],
                 macro=macro[p],
-                initial=_initial(_arm(e, initial, Start.INITIAL), options) if initial else _undefined(),
+                initial=_initial(_arm(e, initial, Start.INITIAL, run_of), options)
+                if initial
+                else _undefined(),
                 behind=behind[p],
+                verdict=None if against is None else _of_the_best(against, against is between.get((best, p))),
+                place=_place(p, ranked, between) if p in ranked else None,
                 scenarios=int(run[p]),
                 trials=int(panel.trials[p].sum()),
                 invalid=int(panel.invalid[p].sum()),
                 interventions=acting[p],
                 provenance=_provenance(rows, logs[key, e]),
+                runs=len(methods[p].each),
+                other_runs=methods[p].other_runs,
+                run_sd=methods[p].sd,
+                stopped=arms[p].unreached,
             )
         )
-    found.sort(key=lambda e: (e.interventions, e.scenarios < len(panel.scenarios), -e.rsr.value, e.policy))
-    return Board(platform, name, len(panel.scenarios), dict(simulators), tuple(found), options)
+    entries.sort(key=lambda e: (e.interventions, e.scenarios < len(panel.scenarios), -e.rsr.value, e.policy))
+    name = f"{dataset}, {split}{kind}"
+    digest = hashlib.sha256("\n".join(f"{i} {h}" for i, h in sorted(scenario_set)).encode()).hexdigest()[:12]
+    return Board(
+        platform, name, digest, len(panel.scenarios), dict(simulators), tuple(entries), options, WORDS[unit]
+    )
 
 
-def _arm(entry: tuple, rows: Sequence[TrialRow], start: Start) -> Arm:
-    return Arm(entry[0], Start.RECOVERY, (0,), tuple(r for r in rows if r.start == start))
+def _of_the_best(contrast: Contrast, best_is_a: bool) -> Verdict:
+    return contrast.verdict if best_is_a else contrast.turned().verdict
 
 
-def _same_scenarios(arms: Sequence[Arm]) -> None:
-    known: dict[str, str] = {}
-    for arm in arms:
-        for row in arm.rows:
-            if known.setdefault(row.scenario_id, row.scenario_sha256) != row.scenario_sha256:
-                raise RowsError(
-                    f"scenario {row.scenario_id} is not the same in all logs although they name the "
-                    "same data set"
-                )
+def _place(p: int, ranked: list[int], between: dict[tuple[int, int], Contrast]) -> tuple[int, int]:
+    """Ranks that are left open: below all that are better for certain, above all that are worse for
+    certain."""
+    above = below = 0
+    for (a, b), contrast in between.items():
+        if p in (a, b) and contrast.verdict.separated:
+            ahead = (contrast.verdict is Verdict.A_BETTER) == (p == a)
+            above, below = above + (not ahead), below + ahead
+    return 1 + above, len(ranked) - below
+
+
+def _arm(entry: tuple, rows: Sequence[TrialRow], start: Start, run_of: dict[int, str]) -> Arm:
+    runs: dict[str, list[TrialRow]] = {}
+    for row in rows:
+        if row.start == start:
+            runs.setdefault(run_of[id(row)], []).append(row)
+    return replace(arm_of(entry[0], start, runs), start=Start.RECOVERY, rewind_steps=(0,))
 
 
 def _initial(arm: Arm, options: Options) -> Estimate:
     panel = make_panel([arm])
-    return resample(panel.units(), options.draws, options.seed, options.level).estimates(panel.rates.T)[0]
+    draws = resample(panel.units(options.cluster), options.draws, options.seed, options.level)
+    return draws.rates(panel.rates.T)[0]
 
 
 def _undefined() -> Estimate:
@@ -249,16 +364,14 @@ def as_json(found: Leaderboard) -> dict[str, Any]:
 
 
 def separated(entry: Entry) -> bool:
-    """Whether the board's best is above this entry: the interval of the difference excludes zero."""
-    return not math.isnan(entry.behind.low) and entry.behind.low > 0
+    """Whether the board's best is above this entry, by the verdict of the two."""
+    return entry.verdict is not None and entry.verdict.separated
 
 
 def ranks(board: Board) -> list[str]:
-    """Rank of every entry; no rank for incomplete ones and for interventions."""
-    number = 0
+    """Rank of every entry: those that the verdicts leave open; none for incomplete ones and interventions."""
     texts = []
     for entry in board.entries:
-        counts = not entry.interventions and entry.scenarios == board.scenarios
-        number += counts
-        texts.append(str(number) if counts else "")
+        low, high = entry.place or (0, 0)
+        texts.append("" if entry.place is None else str(low) if low == high else f"{low} to {high}")
     return texts

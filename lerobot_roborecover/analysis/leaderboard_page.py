@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import json
 from pathlib import Path
 
-from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard, as_json, ranks, separated
+from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.analysis.verdicts import Verdict
 from lerobot_roborecover.whole import write_whole
 
 
@@ -23,17 +23,11 @@ def write_leaderboard(
         out: folder; made if need be.
         title: heading of the page.
     """
-    import jinja2
-
-    folder = importlib.resources.files("lerobot_roborecover.analysis")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(folder.joinpath("leaderboard.html.j2").read_text("utf-8"))
-    boards = [{"board": board, "table": board_table(board, n)} for n, board in enumerate(found.boards)]
-    page = template.render(
-        title=title, boards=boards, published=published_table(), refused=found.refused, version=__version__
-    )
+    boards = [
+        {"board": board, "table": board_table(board, n), "published": published_table(board.platform)}
+        for n, board in enumerate(found.boards)
+    ]
+    page = render_page("leaderboard.html.j2", title=title, boards=boards, refused=found.refused)
     files = out / "index.html", out / "leaderboard.json"
     for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
         write_whole(path, text)
@@ -42,47 +36,65 @@ def write_leaderboard(
 
 def board_table(board: Board, number: int = 0) -> Table:
     """One board's entries."""
-    rows = []
+    rows, several = [], any(entry.runs > 1 for entry in board.entries)
     for rank, entry in zip(ranks(board), board.entries, strict=True):
         numbers = (entry.macro, entry.initial, entry.scenarios, entry.trials, entry.invalid)
         standing, day = _standing(entry, rank), entry.provenance.finished_at[:10]
-        rows.append((rank, entry.policy, entry.rsr, entry.behind, standing, *numbers, day))
+        runs = (entry.runs, entry.other_runs, entry.run_sd) if several else ()
+        rows.append((entry.policy, rank, entry.rsr, *runs, entry.behind, standing, *numbers, day))
     columns = (
-        Column("Rank", "count"), Column("Policy"), Column("RSR %", "percent"),
+        Column("Policy"), Column("Rank"), Column("RSR %", "percent"),
+        *((Column("Runs", "count"), Column("RSR %, runs like these", "percent"),
+        Column("SD between runs", "points")) if several else ()),
         Column("Behind the best", "points"), Column("Standing"), Column("Macro %", "percent"),
         Column("Initial state %", "percent"), Column("Scenarios", "count"), Column("Trials", "count"),
         Column("Invalid", "count"), Column("Last trial"),
     )  # fmt: skip
     o = board.options
     notes = (
-        f"[{100 * o.level:g} % intervals], {o.draws} bootstrap draws, seed {o.seed}; differences on "
-        "the same draws, not "
-        "adjusted for their number. Invalid trials count as failures. Incomplete entries lack "
-        "scenarios that others "
-        "were run on and have no rank; neither have interventions.",
+        f"[{100 * o.level:g} % intervals] over {board.unit}, those of differences not adjusted for their "
+        f"number. Standing and rank follow Holm's p of the sign-flip test, at {1 - o.level:.3g} for all "
+        "pairs of complete entries; a rank is what these leave open. Invalid trials count as failures. "
+        "Incomplete entries lack scenarios of the set and have no rank; neither have interventions.",
+        f"Scenario set {board.scenario_set} ({board.scenarios} scenarios), by content: other sets are other "
+        "boards.",
+        *((_OF_RUNS,) if several else ()),
     )
-    return Table(f"board_{number}", f"{board.platform}: {board.dataset}", columns, tuple(rows), notes)
+    title = f"{board.platform}: {board.dataset}, set {board.scenario_set}"
+    return Table(f"board_{number}", title, columns, tuple(rows), notes)
+
+
+_OF_RUNS = (
+    "A method's RSR is the mean of its runs, and rank and standing are said of these runs. Runs like these: "
+    "the interval with the variance between runs, which speaks of the method."
+)
 
 
 def _standing(entry: Entry, rank: str) -> str:
     if entry.interventions:
         return "intervention"
+    if entry.stopped:
+        return "stopped early"
     if not rank:
         return "incomplete"
+    if entry.verdict is None:
+        return "best"
     if separated(entry):
         return "behind the best"
-    return "best" if rank == "1" else "not separated from it"
+    return "no verdict: too few differ" if entry.verdict is Verdict.TOO_FEW else "not separated from it"
 
 
-def published_table() -> Table:
-    """The paper's twelve rows, best first on each platform."""
+def published_table(platform: str) -> Table | None:
+    """The paper's rows of one platform, best first; None where it has none."""
     rows = [
-        (r.platform, r.policy, r.rsr, r.macro9, r.initial)
-        for r in sorted(published.policies(), key=lambda r: (r.platform, -r.rsr.value))
+        (r.policy, r.rsr, r.macro9, r.initial)
+        for r in sorted(published.policies(platform), key=lambda r: -r.rsr.value)
     ]
+    if not rows:
+        return None
     columns = (
-        Column("Platform"), Column("Policy"), Column("RSR %", "percent"), Column("Macro-9 %", "percent"),
+        Column("Policy"), Column("RSR %", "percent"), Column("Macro-9 %", "percent"),
         Column("Initial state %", "percent"),
     )  # fmt: skip
-    notes = ("The paper's numbers on its own 200 test scenarios a platform; not re-run here.",)
-    return Table("published", "Published results", columns, tuple(rows), notes)
+    notes = (f"The paper's numbers on its own 200 test scenarios of {platform}; not re-run here.",)
+    return Table(f"published_{platform}", "Published results", columns, tuple(rows), notes)

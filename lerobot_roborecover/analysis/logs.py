@@ -6,13 +6,18 @@ report shows.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from operator import attrgetter
 from pathlib import Path
 
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, read_trial_log
-from lerobot_roborecover.scenario import DeviationType, Outcome, Source, Stage, Start
+from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
+from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, TrialRow, read_log
+from lerobot_roborecover.scenario import Start
 
 _FIXED_BY_SCENARIO = (
     "scenario_sha256",
@@ -42,6 +47,12 @@ class Arm:
     rewind_steps: tuple[int, ...]
     """Of its trials: one number, or those of the paper's rule, which asks the scenario's horizon."""
     rows: tuple[TrialRow, ...]
+    """Of all its runs. Trials are numbered on from run to run."""
+    runs: tuple[tuple[str, tuple[TrialRow, ...]], ...] = ()
+    """Name and rows of every run, where the policy is a method of several; else empty."""
+    unreached: bool = False
+    """Whether scenarios are missing because a sequential test was decided before their turn: they are no
+    failures, and the policy is not ranked."""
 
     @property
     def title(self) -> str:
@@ -61,6 +72,8 @@ class Study:
     remarks: tuple[str, ...]
     """What a reader of the numbers has to know."""
     logs: tuple[Path, ...]
+    sequential: tuple[SequentialRecord, ...] = ()
+    """Runs of these logs that were watched while they went."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -78,6 +91,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     Args:
         logs: `LOG` or `NAME=LOG`; LOG is a file, or a folder that holds `trials.jsonl` or other `.jsonl`
             files. NAME replaces the policy's own name, and keeps two runs of one policy apart.
+            `METHOD=LOG,LOG,...` takes several runs of one method together, a LOG each.
         platform: keep only this platform's rows.
 
     Raises:
@@ -86,107 +100,94 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     """
     remarks: list[str] = []
     rows: dict[tuple, TrialRow] = {}
-    origin: dict[tuple, Path] = {}
+    run_of: dict[int, int] = {}
+    """By the identity of a row; of rows that are of no run, or of the first, nothing is said."""
     twice = 0
-    files: list[Path] = []
-    for name, path in _files(logs):
-        files.append(path)
-        found = read_trial_log(path)
-        if _cut_off(path):
-            remarks.append(f"{path}: its last line was cut off by a crash and is left out; rerun to complete")
-        if name and len({row.policy for row in found}) > 1:
-            policies = sorted({row.policy for row in found})
+    found: list[ReadLog] = []
+    runs: dict[str, dict[int, str]] = {}
+    records: list[SequentialRecord] = []
+    for name, run, path in _files(logs):
+        log = read_log(path, name or None)
+        found.append(log)
+        if run is not None:
+            runs.setdefault(name, {}).setdefault(run, _run_name(path))
+        if (record := read_record(path)) is not None:
+            records.append(record)
+        remarks += log.remarks
+        if name and len(log.policies) > 1:
             raise RowsError(
-                f"{path} holds {len(policies)} policies ({', '.join(policies)}): no one NAME fits"
+                f"{path} holds {len(log.policies)} policies ({', '.join(log.policies)}): no one NAME fits"
             )
-        for row in found:
-            check_row(row, path)
-            row = replace(row, policy=name) if name else row
-            key = (row.policy, *row.key())
-            other = rows.get(key)
-            if other is None:
-                rows[key], origin[key] = row, path
+        for row in log.rows:
+            other = rows.setdefault((row.policy, run or 0, *row.key()), row)
+            if other is row:
+                if run:
+                    run_of[id(row)] = run
                 continue
             twice += 1
             if (other.outcome, other.steps) != (row.outcome, row.steps):
                 raise RowsError(
-                    f"trial {row.trial} of {row.scenario_id} by {row.policy} ended as "
-                    f"{other.outcome!r} after "
-                    f"{other.steps} steps in {origin[key]} and as {row.outcome!r} after {row.steps} "
-                    f"in {path}. "
+                    f"{_place(row, found)}: field 'outcome': trial {row.trial} of {row.scenario_id} by "
+                    f"{row.policy} ended as {row.outcome!r} after {row.steps} steps, and as "
+                    f"{other.outcome!r} after {other.steps} in {_place(other, found)}. "
                     "Give the runs names (NAME=LOG), or leave one out"
                 )
     if twice:
         remarks.append(f"{twice} row(s) occur in more than one log with the same result; each counts once")
     kept = [row for row in rows.values() if platform is None or row.platform == platform]
-    where = ", ".join(map(str, files))
+    del rows
     if not kept:
+        where = ", ".join(str(log.path) for log in found)
         raise RowsError(f"no trial rows{f' of {platform}' if platform else ''} in {where}")
     _check_platform(kept)
-    _check_scenarios(kept)
+    _check_scenarios(kept, found)
     _check_options(kept)
+    remarks += _revisions(kept, found)
     remarks += _render_qualities(kept)
     remarks += _check_versions(kept)
-    arms = _arms(kept)
-    remarks += _remarks(arms)
-    return Study(kept[0].platform, arms, tuple(remarks), tuple(files))
+    _check_runs(kept, runs, run_of)
+    arms = stopped(_arms(kept, runs, run_of), records)
+    remarks += _remarks(arms) + _sequential_remarks(arms, records)
+    return Study(kept[0].platform, arms, tuple(remarks), tuple(log.path for log in found), tuple(records))
 
 
-def _files(logs: Sequence[str]) -> Iterable[tuple[str, Path]]:
+def _place(row: TrialRow, logs: Sequence[ReadLog]) -> str:
+    """File and line of a row, looked for only where an error or a remark has to name them."""
+    for log in logs:
+        for line, candidate in zip(log.lines, log.rows, strict=True):
+            if candidate is row:
+                return f"{log.path}, line {line}"
+    raise ValueError("the row is of none of these logs")
+
+
+def _files(logs: Sequence[str]) -> Iterable[tuple[str, int | None, Path]]:
+    """Name, run and file of every log; the run is None where the name has but one."""
     for text in logs:
-        name, _, rest = text.rpartition("=") if not Path(text).exists() else ("", "", text)
-        path = Path(rest)
-        if path.is_dir():
-            inside = (
-                [path / "trials.jsonl"] if (path / "trials.jsonl").is_file() else sorted(path.glob("*.jsonl"))
-            )
-            if not inside:
-                raise TrialLogError(
-                    f"no trial log in {path}: a folder must hold trials.jsonl or *.jsonl files"
-                )
-            yield from ((name, file) for file in inside)
-        else:
-            yield name, path
+        name, rest = split_named(text)
+        parts = split_runs(rest)
+        if len(parts) > 1 and not name:
+            raise RowsError(f"{text!r}: several runs take the name of their method: METHOD={text}")
+        for run, part in enumerate(parts):
+            for path in _in_folder(Path(part), text):
+                yield name, run if len(parts) > 1 else None, path
 
 
-def _cut_off(path: Path) -> bool:
-    with open(path, "rb") as file:
-        file.seek(0, 2)
-        if not file.tell():
-            return False
-        file.seek(-1, 2)
-        return file.read(1) != b"\n"
+def _in_folder(path: Path, text: str) -> Iterable[Path]:
+    if path.is_dir():
+        inside = (
+            [path / "trials.jsonl"] if (path / "trials.jsonl").is_file() else sorted(path.glob("*.jsonl"))
+        )
+        if not inside:
+            raise TrialLogError(f"no trial log in {path}: a folder must hold trials.jsonl or *.jsonl files")
+        return inside
+    if not path.exists():
+        raise TrialLogError(f"cannot read trial log {path}: {missing(text, path)}")
+    return [path]
 
 
-def check_row(row: TrialRow, path: Path) -> None:
-    """Checks what the log's reader does not: values that every estimator relies on.
-
-    Raises:
-        TrialLogError: naming the file, the trial and the field.
-    """
-    where = f"{path}: trial {row.trial!r} of {row.scenario_id!r}"
-    for field, enum in (
-        ("outcome", Outcome), ("start", Start), ("stage", Stage), ("deviation", DeviationType), ("source",
-        Source),
-    ):  # fmt: skip
-        if getattr(row, field) not in list(enum):
-            raise TrialLogError(
-                f"{where}: {field} {getattr(row, field)!r} is not one of {[m.value for m in enum]}"
-            )
-    if row.success is not (row.outcome == Outcome.SUCCESS):
-        raise TrialLogError(f"{where}: success is {row.success!r} but the outcome is {row.outcome!r}")
-    for field in ("trial", "steps", "horizon", "rewind_steps"):
-        value = getattr(row, field)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            raise TrialLogError(f"{where}: {field} is {value!r}, not a count")
-    for field in ("policy", "cluster", "source_policy", "suite", "task", "instruction", "finished_at"):
-        if not isinstance(getattr(row, field), str):
-            raise TrialLogError(f"{where}: {field} is {getattr(row, field)!r}, not text")
-    for field, kind in (("versions", dict), ("options", dict), ("interventions", list)):
-        if not isinstance(getattr(row, field), kind):
-            raise TrialLogError(
-                f"{where}: {field} is {str(getattr(row, field))[:80]!r}, not a {kind.__name__}"
-            )
+def _run_name(path: Path) -> str:
+    """What a run is called: its log, or the folder of a log that is called like all of them."""
+    return path.parent.name if path.name == "trials.jsonl" and path.parent.name else path.stem
 
 
 def _check_platform(rows: Sequence[TrialRow]) -> None:
@@ -199,21 +200,56 @@ def _check_platform(rows: Sequence[TrialRow]) -> None:
         )
 
 
-def _check_scenarios(rows: Sequence[TrialRow]) -> None:
-    known: dict[str, TrialRow] = {}
+def _check_scenarios(rows: Sequence[TrialRow], logs: Sequence[ReadLog]) -> None:
+    known: dict[str, tuple[tuple, TrialRow]] = {}
     for row in rows:
-        first = known.setdefault(row.scenario_id, row)
-        for field in _FIXED_BY_SCENARIO:
-            if getattr(first, field) != getattr(row, field):
+        values = _fixed(row)
+        before, first = known.setdefault(row.scenario_id, (values, row))
+        if before == values:
+            continue
+        for field, one, other in zip(_FIXED_BY_SCENARIO, before, values, strict=True):
+            if one != other:
                 raise RowsError(
-                    f"logs of different scenario sets: scenario {row.scenario_id} has {field} "
-                    f"{getattr(first, field)!r} for {first.policy} (dataset {first.dataset}) and "
-                    f"{getattr(row, field)!r} for {row.policy} (dataset {row.dataset}). Evaluate "
-                    "both on one set"
+                    f"{_place(row, logs)}: field {field!r}: logs of different scenario sets: scenario "
+                    f"{row.scenario_id} has {field} {one!r} for {first.policy} (dataset {first.dataset}) and "
+                    f"{other!r} for {row.policy} (dataset {row.dataset}). Evaluate both on one set"
                 )
 
 
+_fixed = attrgetter(*_FIXED_BY_SCENARIO)
+
+
+def _revisions(rows: Sequence[TrialRow], logs: Sequence[ReadLog]) -> list[str]:
+    """A remark where trials name several sources of their scenarios.
+
+    Their content is the same, or the rows would have been refused; a reader who wants to run them again has
+    to know.
+    """
+    users: dict[tuple[str, str], TrialRow] = {}
+    for row in rows:
+        users.setdefault((row.dataset, row.dataset_revision or ""), row)
+    if len(users) < 2:
+        return []
+    text = "; ".join(
+        f"{dataset}{f' at {revision}' if revision else ''} ({_place(row, logs)})"
+        for (dataset, revision), row in sorted(users.items())
+    )
+    return [
+        "the scenarios have the same content in all logs, but the fields 'dataset' and 'dataset_revision' "
+        f"differ: {text}. Evaluate all policies with one --env.scenarios and --env.revision"
+    ]
+
+
+def _apart(rows: Sequence[TrialRow], field: str) -> list[TrialRow]:
+    """The first row of every policy with every object of that field: rows of a log share them."""
+    found: dict[tuple[str, int], TrialRow] = {}
+    for row in rows:
+        found.setdefault((row.policy, id(getattr(row, field))), row)
+    return list(found.values())
+
+
 def _check_options(rows: Sequence[TrialRow]) -> None:
+    rows = _apart(rows, "options")
     users: dict[bool, str] = {}
     for row in rows:
         users.setdefault(bool(row.options.get("handoff_check", True)), row.policy)
@@ -235,12 +271,12 @@ def _check_options(rows: Sequence[TrialRow]) -> None:
 
 
 def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
-    """A remark where policies saw pictures of different quality (RoboTwin)."""
+    """A remark where policies saw pictures of different quality; a row that says none has LeRobot's own
+    (`platforms.base.chosen_quality`)."""
     users: dict[str, str] = {}
-    for row in rows:
-        quality = row.options.get("render_quality", "none")
-        if quality != "none":
-            users.setdefault(str(quality), row.policy)
+    for row in _apart(rows, "options"):
+        users.setdefault(str(row.options.get("render_quality", "full")), row.policy)
+    users.pop("none", None)
     if len(users) < 2:
         return []
     text = ", ".join(f"{quality} ({policy})" for quality, policy in sorted(users.items()))
@@ -249,6 +285,7 @@ def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
 
 def _check_versions(rows: Sequence[TrialRow]) -> list[str]:
     remarks = []
+    rows = _apart(rows, "versions")
     for name in sorted({name for row in rows for name in row.versions}):
         users: dict[str, str] = {}
         for row in rows:
@@ -265,25 +302,109 @@ def _check_versions(rows: Sequence[TrialRow]) -> list[str]:
     return remarks
 
 
-def _arms(rows: Sequence[TrialRow]) -> tuple[Arm, ...]:
-    groups: dict[tuple, list[TrialRow]] = {}
+def _arms(
+    rows: Sequence[TrialRow], runs: Mapping[str, Mapping[int, str]], run_of: Mapping[int, int]
+) -> tuple[Arm, ...]:
+    groups: dict[tuple, dict[int, list[TrialRow]]] = {}
     for row in rows:
         rewind = row.options.get("rewind_rule") or row.rewind_steps
-        groups.setdefault((row.policy, row.start, rewind), []).append(row)
+        groups.setdefault((row.policy, row.start, rewind), {}).setdefault(run_of.get(id(row), 0), []).append(
+            row
+        )
     arms = []
-    for (policy, start, _), group in groups.items():
-        settings: dict[str, TrialRow] = {}
-        for row in group:
-            settings.setdefault(row.config_hash, row)
-        if len(settings) > 1:
-            first, second = list(settings.values())[:2]
-            raise RowsError(
-                f"{policy} has {start} trials under {len(settings)} settings, which differ in "
-                f"{_differences(first, second)}. Give each run a name (NAME=LOG), or leave one out"
-            )
-        rewinds = sorted({row.rewind_steps for row in group})
-        arms.append(Arm(policy, Start(start), tuple(rewinds), tuple(group)))
+    for (policy, start, _), by_run in groups.items():
+        for group in by_run.values():
+            settings: dict[str, TrialRow] = {}
+            for row in group:
+                settings.setdefault(row.config_hash, row)
+            if len(settings) > 1:
+                first, second = list(settings.values())[:2]
+                raise RowsError(
+                    f"{policy} has {start} trials under {len(settings)} settings, which differ in "
+                    f"{_differences(first, second)}. Give each run a name (NAME=LOG), name the runs of one "
+                    "method together (METHOD=LOG,LOG), or leave one out"
+                )
+        names = runs.get(policy, {})
+        arms.append(arm_of(policy, Start(start), {names.get(k, policy): by_run[k] for k in sorted(by_run)}))
     return tuple(arms)
+
+
+def _check_runs(
+    rows: Sequence[TrialRow], runs: Mapping[str, Mapping[int, str]], run_of: Mapping[int, int]
+) -> None:
+    """Refuses a run that is named twice: it would make a method look surer than it is."""
+    ended: dict[tuple[str, int], set[tuple]] = {}
+    for row in rows:
+        if row.policy in runs:
+            end = (*row.key(), row.outcome, row.steps, row.actions_sha256)
+            ended.setdefault((row.policy, run_of.get(id(row), 0)), set()).add(end)
+    for (name, first), (other, second) in combinations(ended, 2):
+        if name == other and ended[name, first] & ended[name, second]:
+            raise RowsError(
+                f"{name}: {runs[name][first]} and {runs[name][second]} hold the same trials, with the same "
+                "seed, actions and outcomes: they are one run. Name each run once"
+            )
+
+
+def arm_of(policy: str, start: Start, runs: Mapping[str, Sequence[TrialRow]]) -> Arm:
+    """One arm of one run or several, whose trials are numbered on from run to run.
+
+    Args:
+        policy: its name.
+        start: of all trials.
+        runs: rows by the name of their run; at least one.
+
+    Raises:
+        RowsError: the runs differ in more than weights and seed.
+    """
+    firsts = [rows[0] for rows in runs.values()]
+    for first, run in zip(firsts, runs, strict=True):
+        for field in ("execution_horizon", "options"):
+            if getattr(first, field) != getattr(firsts[0], field):
+                raise RowsError(
+                    f"{policy}: its runs differ in {field}: {getattr(firsts[0], field)} in "
+                    f"{next(iter(runs))}, {getattr(first, field)} in {run}. Runs of one method differ in "
+                    "weights and seed alone; give them names of their own (NAME=LOG)"
+                )
+    rewinds = tuple(sorted({row.rewind_steps for rows in runs.values() for row in rows}))
+    if len(runs) == 1:
+        (rows,) = runs.values()
+        return Arm(policy, start, rewinds, tuple(rows))
+    stride = 1 + max(row.trial for rows in runs.values() for row in rows)
+    numbered = tuple(
+        (run, tuple(replace(row, trial=row.trial + k * stride) for row in rows))
+        for k, (run, rows) in enumerate(runs.items())
+    )
+    return Arm(policy, start, rewinds, tuple(row for _, rows in numbered for row in rows), numbered)
+
+
+def stopped(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> tuple[Arm, ...]:
+    """The arms, those marked whose run ended when its sequential test was decided."""
+    planned = {(r.config_hash, r.start): r for r in records}
+    found = []
+    for arm in arms:
+        record = planned.get((arm.rows[0].config_hash, arm.start.value))
+        if record is not None:
+            trials = Counter(row.scenario_id for row in arm.rows)
+            short = any(trials[scenario] < record.trials for scenario in record.scenarios)
+            arm = replace(arm, unreached=record.decided and short)
+        found.append(arm)
+    return tuple(found)
+
+
+def _sequential_remarks(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> list[str]:
+    remarks = []
+    for record in records:
+        for arm in arms:
+            if (arm.rows[0].config_hash, arm.start.value) == (record.config_hash, record.start):
+                more = (
+                    "; it stopped there: scenarios after it are no failures, the policy is not ranked, and "
+                    "only this pair has a verdict"
+                    if arm.unreached
+                    else ""
+                )
+                remarks.append(f"{arm.title}: its run was watched, and {record.words}{more}")
+    return remarks
 
 
 def _differences(first: TrialRow, second: TrialRow) -> str:
@@ -307,6 +428,15 @@ def _remarks(arms: Sequence[Arm]) -> list[str]:
         start: {row.scenario_id for arm in arms if arm.start is start for row in arm.rows} for start in Start
     }
     for arm in arms:
+        if arm.runs:
+            run_on = [{row.scenario_id for row in rows} for _, rows in arm.runs]
+            lacking_runs = set.union(*run_on) - set.intersection(*run_on)
+            if lacking_runs:
+                remarks.append(
+                    f"{arm.title}: {len(lacking_runs)} of {len(set.union(*run_on))} scenarios lack one of "
+                    f"its {len(run_on)} runs ({_some(lacking_runs)}) and do not count for it, unless "
+                    "--trials says how many trials were scheduled"
+                )
         trials: dict[str, set[int]] = {}
         for row in arm.rows:
             trials.setdefault(row.scenario_id, set()).add(row.trial)

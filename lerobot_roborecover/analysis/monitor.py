@@ -1,5 +1,5 @@
 """Metrics of a recovery monitor; label 1 is "deviated". Frames come from a dataset with labels, episodes from
-their order; intervals resample scenarios, because frames of one scenario look alike."""
+their order; intervals take scenarios as independent, because frames of one scenario look alike."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
+from lerobot_roborecover.analysis.resampling import resample
 
 
 @dataclass(frozen=True)
@@ -133,16 +133,40 @@ def metric_columns(counts: np.ndarray) -> np.ndarray:
     return np.stack([columns[name] for name in METRICS], axis=1)
 
 
-def episode_metrics(frames: MonitorFrames, sampling: Resampling, ids: np.ndarray) -> EpisodeMetrics:
+def metric_weights(counts: np.ndarray) -> np.ndarray:
+    """(n, 6) frames that each metric looks at, of (n, 4) confusion counts by scenario: F1 looks twice at
+    hits; of the two halves of Macro-F1, the one that rests on fewer scenarios."""
+    tn, fp, fn, tp = counts.T
+    f1, f0 = 2 * tp + fp + fn, 2 * tn + fp + fn
+    columns = {
+        "accuracy": counts.sum(1),
+        "precision": tp + fp,
+        "recall": tp + fn,
+        "f1": f1,
+        "macro_f1": fewer(f1, f0),
+        "false_positive_rate": fp + tn,
+    }
+    return np.stack([columns[name] for name in METRICS], axis=1)
+
+
+def fewer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two (n,) weights, the one under which fewer of the n count."""
+
+    def effective(w: np.ndarray) -> float:
+        return float(w.sum() ** 2 / (w**2).sum()) if w.any() else 0.0
+
+    return a if effective(a) < effective(b) else b
+
+
+def episode_metrics(frames: MonitorFrames, level: float = LEVEL) -> EpisodeMetrics:
     """Triggers and delays by trajectory.
 
     Args:
         frames: labelled and judged.
-        sampling: draws over the scenarios.
-        ids: the scenarios in the order of the draws.
+        level: confidence level.
     """
     episodes, first = np.unique(frames.episode, return_index=True)
-    owner = np.searchsorted(ids, frames.scenario[first])
+    sampling = resample(frames.scenario[first], level=level)
     delays, early, complete = np.full(len(episodes), np.nan), np.zeros(len(episodes)), True
     for number, episode in enumerate(episodes):
         mine = frames.episode == episode
@@ -157,22 +181,14 @@ def episode_metrics(frames: MonitorFrames, sampling: Resampling, ids: np.ndarray
         complete &= len(watched) > 0 and watched[0] == start and bool((np.diff(watched) == 1).all())
     triggered = np.isfinite(delays)
 
-    def mean_of(values: np.ndarray, counted: np.ndarray) -> Estimate:
-        sums = np.bincount(owner, np.where(counted, values, 0.0), len(ids))
-        mass = np.bincount(owner, counted.astype(float), len(ids))
-        if not mass.sum():
-            return Estimate(np.nan, np.nan, np.nan)
-        top, bottom = sampling.weights @ sums, sampling.weights @ mass
-        drawn = np.divide(top, bottom, out=np.full(len(top), np.nan), where=bottom > 0)[:, None]
-        low, high = sampling.interval(drawn)
-        return Estimate(float(sums.sum() / mass.sum()), float(low[0]), float(high[0]))
-
-    everyone = np.ones(len(episodes), dtype=bool)
+    # Delays lie between none and the longest that could be seen: few equal ones must not look sure.
+    most = max(float((frames.step - frames.recovery_step).max()), 1.0)
+    trigger_rate, early_rate, share = sampling.rates(np.stack([triggered, early, delays / most], 1))
     return EpisodeMetrics(
         trajectories=len(episodes),
-        trigger_rate=mean_of(triggered.astype(float), everyone),
-        early_rate=mean_of(early, everyone),
-        delay_mean=mean_of(delays, triggered),
+        trigger_rate=trigger_rate,
+        early_rate=early_rate,
+        delay_mean=Estimate(*(most * v for v in (share.value, share.low, share.high))),
         delays=delays,
         every_step=complete,
     )

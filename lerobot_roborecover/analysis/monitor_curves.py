@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames, metric_columns
-from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, jackknife, rate_interval
+from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames, fewer, metric_columns
 
 
 @dataclass(frozen=True)
@@ -31,20 +30,22 @@ def _ordered(frames: MonitorFrames, row: np.ndarray) -> tuple[np.ndarray, np.nda
     return score, frames.label[order], row[order], last
 
 
-def precision_recall(frames: MonitorFrames, row: np.ndarray, few: Resampling) -> Curve:
+def precision_recall(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
     """Precision over recall; the area is the average precision (no interpolation).
 
     Args:
         frames: labelled and judged.
-        row: (N,) scenario of each frame, as a column of the draws.
-        few: draws over the scenarios.
+        row: (N,) scenario of each frame, counted from zero.
+        level: confidence level of the area.
     """
     score, label, rows, last = _ordered(frames, row)
+    count = int(row.max()) + 1
     # Frames whose answer cannot be read never trigger; those of label 1 are missed at every threshold.
-    missed = np.bincount(row[~frames.parsed & (frames.label == 1)], minlength=few.weights.shape[1])
+    missed = np.bincount(row[~frames.parsed & (frames.label == 1)], minlength=count)
+    deviated = np.bincount(row[frames.label == 1], minlength=count)
 
-    def curve(weights: np.ndarray, lost: float) -> tuple[np.ndarray, np.ndarray]:
-        hits, flagged = np.cumsum(weights * label)[last], np.cumsum(weights)[last]
+    def curve(counted: np.ndarray, lost: float) -> tuple[np.ndarray, np.ndarray]:
+        hits, flagged = np.cumsum(counted * label)[last], np.cumsum(counted)[last]
         everything = (hits[-1] if len(hits) else 0.0) + lost
         recall = hits / everything if everything else np.full(len(hits), np.nan)
         return recall, np.divide(hits, flagged, out=np.ones(len(hits)), where=flagged > 0)
@@ -53,18 +54,18 @@ def precision_recall(frames: MonitorFrames, row: np.ndarray, few: Resampling) ->
         return float(np.sum(np.diff(recall, prepend=0.0) * precision)) if len(recall) else np.nan
 
     recall, precision = curve(np.ones(len(rows)), float(missed.sum()))
-    drawn = np.array([average_precision(*curve(w[rows], float(w @ missed))) for w in few.weights])[:, None]
-    low, high = few.interval(drawn)
-    area = Estimate(average_precision(recall, precision), float(low[0]), float(high[0]))
+    left_out = [average_precision(*curve(rows != i, float(missed.sum() - missed[i]))) for i in range(count)]
+    area = _area(average_precision(recall, precision), left_out, deviated, level)
     return Curve(recall, precision, score[last], area)
 
 
-def roc(frames: MonitorFrames, row: np.ndarray, few: Resampling) -> Curve:
+def roc(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
     """Recall over false-positive rate, among the answers that can be read; arguments as above."""
     score, label, rows, last = _ordered(frames, row)
+    count = int(row.max()) + 1
 
-    def curve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        hits, alarms = np.cumsum(weights * label)[last], np.cumsum(weights * (1 - label))[last]
+    def curve(counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        hits, alarms = np.cumsum(counted * label)[last], np.cumsum(counted * (1 - label))[last]
         rates = []
         for counts in (alarms, hits):
             total = counts[-1] if len(counts) else 0.0
@@ -72,10 +73,15 @@ def roc(frames: MonitorFrames, row: np.ndarray, few: Resampling) -> Curve:
         return rates[0], rates[1]
 
     x, y = curve(np.ones(len(rows)))
-    drawn = np.array([np.trapezoid(*reversed(curve(w[rows]))) for w in few.weights])[:, None]
-    low, high = few.interval(drawn)
-    area = Estimate(float(np.trapezoid(y, x)), float(low[0]), float(high[0]))
+    left_out = [np.trapezoid(*reversed(curve(rows != i))) for i in range(count)]
+    by_label = [np.bincount(rows[label == one], minlength=count) for one in (0, 1)]
+    area = _area(float(np.trapezoid(y, x)), left_out, fewer(*by_label), level)
     return Curve(x, y, np.insert(score[last], 0, np.inf), area)
+
+
+def _area(value: float, left_out: list[float], weights: np.ndarray, level: float) -> Estimate:
+    low, high = rate_interval(jackknife(value, np.array(left_out, float), weights), level)
+    return Estimate(value, low, high)
 
 
 RULES = ("macro_f1", "f1", "accuracy", "youden")

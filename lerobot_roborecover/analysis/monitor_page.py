@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import json
 import math
@@ -11,12 +10,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
+from lerobot_roborecover.analysis.escape import csv_text
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames
 from lerobot_roborecover.analysis.monitor_curves import Curve
 from lerobot_roborecover.analysis.monitor_report import MonitorReport
+from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import (
     INK,
     LINE,
@@ -26,10 +27,10 @@ from lerobot_roborecover.analysis.style import (
     dash,
     drawing,
     number,
-    render,
+    png_of,
     short,
+    svg_of,
 )
-from lerobot_roborecover.analysis.summary import Estimate
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown, to_text
 
 TITLES = {
@@ -59,8 +60,8 @@ def metrics_table(measured: Sequence[Measured], level: float) -> Table:
     columns = (Column("Validation"), *(Column(TITLES[m], "percent") for m in METRICS))
     rows = tuple((m.name, *(m.report.metrics[k] for k in METRICS)) for m in measured)
     note = (
-        f"In per cent with {100 * level:g} % intervals from resampling scenarios. Precision, recall and "
-        "F1 are of label 1."
+        f"In per cent with {100 * level:g} % intervals over scenarios (docs/report.md, Intervals and tests). "
+        "Precision, recall and F1 are of label 1."
     )
     return Table("metrics", "Frames", columns, rows, (note,))
 
@@ -200,11 +201,9 @@ def write_monitor_report(
     (out / "monitor.md").write_text("\n".join(map(to_markdown, tables)), encoding="utf-8")
     pictures = []
     for figure in figures(measured):
-        svg, png = render(figure)
-        (out / f"{figure.name}.svg").write_bytes(svg)
-        (out / f"{figure.name}.png").write_bytes(png)
-        data = base64.b64encode(png).decode()
-        pictures.append({"title": figure.title, "alt": figure.description, "data": data})
+        (out / f"{figure.name}.svg").write_bytes(svg_of(figure.plot))
+        (out / f"{figure.name}.png").write_bytes(png_of(figure.plot))
+        pictures.append(picture(figure))
     for m in measured:
         _write_frames(out / "frames" / f"{m.name}.csv", m.frames)
         for name in ("precision_recall", "roc"):
@@ -215,21 +214,8 @@ def write_monitor_report(
         "datasets": {m.name: to_json(m.report) for m in measured},
     }
     (out / "metrics.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lerobot_roborecover.analysis", ""), autoescape=True, trim_blocks=True
-    )
-    page = environment.get_template("monitor.html.j2").render(
-        about=about,
-        pictures=pictures,
-        tables=[
-            {
-                "title": t.title,
-                "head": [c.title for c in t.columns],
-                "rows": list(t.texts()),
-                "notes": t.all_notes(),
-            }
-            for t in tables
-        ],
+    page = render_page(
+        "monitor.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
     )
     (out / "monitor.html").write_text(page, encoding="utf-8")
     return out / "monitor.html"
@@ -280,7 +266,7 @@ def _write_frames(path: Path, frames: MonitorFrames) -> None:
             *(getattr(frames, n) for n in names), strict=True
         ):
             shown = "" if math.isnan(score) else f"{score:.6g}"
-            writer.writerow([scenario, episode, step, start, label, shown, int(decision)])
+            writer.writerow([csv_text(str(scenario)), episode, step, start, label, shown, int(decision)])
 
 
 def _write_curve(path: Path, curve: Curve, name: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import DRAWS, LEVEL
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, jackknife, rate_interval
 from lerobot_roborecover.analysis.monitor import (
     METRICS,
     EpisodeMetrics,
@@ -14,13 +14,9 @@ from lerobot_roborecover.analysis.monitor import (
     confusion_by_scenario,
     episode_metrics,
     metric_columns,
+    metric_weights,
 )
 from lerobot_roborecover.analysis.monitor_curves import Curve, precision_recall, roc
-from lerobot_roborecover.analysis.resampling import SEED, resample
-from lerobot_roborecover.analysis.summary import Estimate
-
-CURVE_DRAWS = 1000
-"""Most draws for the areas under the curves: each passes over all frames."""
 
 
 @dataclass(frozen=True)
@@ -41,35 +37,36 @@ class MonitorReport:
     """x false-positive rate, y recall."""
 
 
-def monitor_report(
-    frames: MonitorFrames, *, draws: int = DRAWS, seed: int = SEED, level: float = LEVEL
-) -> MonitorReport:
-    """All numbers with intervals by scenario bootstrap.
+def monitor_report(frames: MonitorFrames, *, level: float = LEVEL) -> MonitorReport:
+    """All numbers with intervals over scenarios.
 
     Args:
         frames: labelled and judged.
-        draws: bootstrap draws; the areas under the curves take `CURVE_DRAWS` at most.
-        seed: of the draws.
         level: confidence level.
     """
     ids, row = np.unique(frames.scenario, return_inverse=True)
-    sampling = resample(list(ids), draws, seed, level)
     counts = confusion_by_scenario(frames, row, len(ids))
     total = counts.sum(0)
-    drawn = sampling.weights @ counts
-    point, spread = metric_columns(total[None]), metric_columns(drawn)
-    low, high = sampling.interval(spread)
-    metrics = {
-        name: Estimate(float(point[0, k]), float(low[k]), float(high[k])) for k, name in enumerate(METRICS)
-    }
-    few = resample(list(ids), min(draws, CURVE_DRAWS), seed, level)
     return MonitorReport(
         frames=len(frames.label),
         scenarios=len(ids),
         confusion=tuple(int(v) for v in total),
         unparsed=int((~frames.parsed).sum()),
-        metrics=metrics,
-        episodes=episode_metrics(frames, sampling, ids),
-        precision_recall=precision_recall(frames, row, few),
-        roc=roc(frames, row, few),
+        metrics=metric_estimates(counts, level),
+        episodes=episode_metrics(frames, level),
+        precision_recall=precision_recall(frames, row, level),
+        roc=roc(frames, row, level),
     )
+
+
+def metric_estimates(counts: np.ndarray, level: float = LEVEL) -> dict[str, Estimate]:
+    """The metrics by name, with intervals over scenarios.
+
+    Args:
+        counts: (scenarios, 4) TN, FP, FN, TP.
+        level: confidence level.
+    """
+    total = counts.sum(0)
+    (point,), left_out = metric_columns(total[None]), metric_columns(total - counts)
+    low, high = rate_interval(jackknife(point, left_out.T, metric_weights(counts).T), level)
+    return {name: Estimate(float(point[k]), float(low[k]), float(high[k])) for k, name in enumerate(METRICS)}

@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import Arm
+from lerobot_roborecover.analysis.units import Unit, default_unit, unit_labels
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage
 
@@ -64,13 +65,37 @@ class Panel:
         """(N,) str: one label of every scenario, by the name of its field."""
         return np.array([getattr(s, name) for s in self.scenarios], dtype=str)
 
-    def units(self) -> np.ndarray:
-        """(N,) str: what the bootstrap resamples: trajectory clusters on RoboTwin, scenarios elsewhere."""
-        return np.array(
-            [
-                s.cluster if s.platform == "robotwin" and s.cluster else f"scenario:{s.id}"
-                for s in self.scenarios
-            ]
+    def unit(self, asked: Unit | None = None) -> Unit:
+        """What is taken as independent: what was asked for, by default what the paper resamples."""
+        return asked or default_unit(self.scenarios[0].platform)
+
+    def units(self, asked: Unit | None = None) -> np.ndarray:
+        """(N,) str: scenarios with the same label are one unit."""
+        return unit_labels(
+            self.unit(asked),
+            [s.id for s in self.scenarios],
+            [s.cluster for s in self.scenarios],
+            [f"{s.suite}/{s.task}" for s in self.scenarios],
+        )
+
+    def take(self, arms: Sequence[int], scenarios: Sequence[int]) -> Panel:
+        """Some of the arms on some of the scenarios, by index."""
+        if len(arms) == len(self.arms) and len(scenarios) == len(self.scenarios):
+            return self
+        chosen = np.ix_(arms, scenarios)
+        new_arm = {p: i for i, p in enumerate(arms)}
+        new_scenario = {n: i for i, n in enumerate(scenarios)}
+        return Panel(
+            tuple(self.arms[p] for p in arms),
+            tuple(self.scenarios[n] for n in scenarios),
+            self.successes[chosen],
+            self.trials[chosen],
+            self.invalid[chosen],
+            {
+                (new_arm[p], new_scenario[n]): rows
+                for (p, n), rows in self.rows.items()
+                if p in new_arm and n in new_scenario
+            },
         )
 
     def occupied(self, name: str) -> tuple[str, ...]:
@@ -94,8 +119,9 @@ def make_panel(
 
     Args:
         arms: one start; at least one.
-        scheduled: trials that every scenario was to have; those without a row count as failures. None takes
-            the rows for all there is.
+        scheduled: trials that every scenario was to have from every arm; those without a row count as
+            failures, also where a scenario has none at all, except where a sequential test had ended the run
+            before. None takes the rows for all there is. Of a method, in every run.
         scenarios: ids to keep; by default all that an arm was run on.
 
     Raises:
@@ -104,9 +130,12 @@ def make_panel(
     labels: dict[str, ScenarioLabels] = {}
     cells: dict[tuple[int, str], list[TrialRow]] = {}
     for p, arm in enumerate(arms):
+        whole = None if scheduled is not None else _of_every_run(arm)
         for row in arm.rows:
-            labels.setdefault(row.scenario_id, _labels(row))
-            cells.setdefault((p, row.scenario_id), []).append(row)
+            if row.scenario_id not in labels:
+                labels[row.scenario_id] = _labels(row)
+            if whole is None or row.scenario_id in whole:
+                cells.setdefault((p, row.scenario_id), []).append(row)
     keep = set(labels) if scenarios is None else set(scenarios) & set(labels)
     ids = sorted(keep)
     if not ids:
@@ -114,23 +143,36 @@ def make_panel(
     index = {scenario_id: n for n, scenario_id in enumerate(ids)}
     shape = (len(arms), len(ids))
     successes, trials, invalid = (np.zeros(shape, int) for _ in range(3))
+    if scheduled is not None:
+        trials[:] = scheduled * np.array([max(1, len(arm.runs)) for arm in arms])[:, None]
     rows: dict[tuple[int, int], tuple[TrialRow, ...]] = {}
     for (p, scenario_id), group in cells.items():
         if scenario_id not in index:
             continue
         n = index[scenario_id]
-        if scheduled is not None and len(group) > scheduled:
+        if scheduled is not None and len(group) > trials[p, n]:
             raise RowsError(
-                f"{arms[p].title} has {len(group)} trials of {scenario_id}; {scheduled} were "
+                f"{arms[p].title} has {len(group)} trials of {scenario_id}; {trials[p, n]} were "
                 "scheduled (--trials)"
             )
         rows[p, n] = tuple(sorted(group, key=lambda r: r.trial))
         successes[p, n] = sum(r.success for r in group)
-        trials[p, n] = len(group) if scheduled is None else scheduled
+        if scheduled is None:
+            trials[p, n] = len(group)
         invalid[p, n] = sum(not Outcome(r.outcome).valid for r in group)
+    for p, arm in enumerate(arms):
+        if scheduled is not None and arm.unreached:
+            trials[p, [(p, n) not in rows for n in range(len(ids))]] = 0
     return Panel(
         tuple(arm.title for arm in arms), tuple(labels[i] for i in ids), successes, trials, invalid, rows
     )
+
+
+def _of_every_run(arm: Arm) -> set[str] | None:
+    """Scenarios that all runs of a method were made on; None where there is one run."""
+    if not arm.runs:
+        return None
+    return set.intersection(*({row.scenario_id for row in rows} for _, rows in arm.runs))
 
 
 def _labels(row: TrialRow) -> ScenarioLabels:

@@ -7,10 +7,7 @@ import importlib.resources
 from dataclasses import dataclass
 from functools import cache
 
-import numpy as np
-
-from lerobot_roborecover.analysis.estimators import macro, rsr
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.intervals import Estimate
 
 TABLES = (
     "contrasts",
@@ -97,50 +94,3 @@ def cell_counts(platform: str) -> dict[str, int]:
         f"{row['stage']}-{row['deviation_type']}": int(row[f"{platform}_test"])
         for row in table("stage_type_counts")
     }
-
-
-def cell_rates(platform: str, policy: str) -> dict[str, float]:
-    """Rate of a policy in every cell, in [0, 1].
-
-    LIBERO's are published to 0.1 point but are multiples of 1 / (5 n), which brings the missing digits back.
-    """
-    counts = cell_counts(platform)
-    rates = {
-        f"{row['stage']}-{row['deviation_type']}": float(row["rsr"]) / 100
-        for row in table("stage_type_rates")
-        if (row["platform"], row["policy"]) == (platform, policy)
-    }
-    if platform != "libero":
-        return rates
-    return {cell: _unrounded(rate, LIBERO_TRIALS * counts[cell]) for cell, rate in rates.items()}
-
-
-def _unrounded(rate: float, trials: int) -> float:
-    """The multiple of 1 / trials that rounds to the published rate; the rate itself where none does."""
-    exact = round(rate * trials) / trials
-    return exact if abs(exact - rate) <= 0.0005 + 1e-9 else rate
-
-
-def overall_from_cells(platform: str, policy: str) -> tuple[float, float]:
-    """Overall RSR and Macro-9 of a policy, worked out from its published cells with our own estimators."""
-    counts, rates = cell_counts(platform), cell_rates(platform, policy)
-    cells = np.repeat(list(counts), list(counts.values()))
-    values = np.array([rates[cell] for cell in cells])
-    return rsr(values), macro(values, cells)
-
-
-def overall_from_groups(axis: str, policy: str) -> float:
-    """Overall RSR on LIBERO from the published rates by `construction_source` or by `suite`."""
-    rows = [row for row in table("libero_groups") if (row["axis"], row["policy"]) == (axis, policy)]
-    counts = np.array([int(row["n"]) for row in rows])
-    rates = [_unrounded(float(r["rsr"]) / 100, LIBERO_TRIALS * n) for r, n in zip(rows, counts, strict=True)]
-    return float(counts @ np.array(rates) / counts.sum())
-
-
-def source_rows(platform: str) -> dict[str, dict[str, float]]:
-    """Source × recovery matrix: rates in [0, 1] by source policy, then by recovery policy."""
-    rows: dict[str, dict[str, float]] = {}
-    for row in table("source_matrix"):
-        if row["platform"] == platform:
-            rows.setdefault(row["source_policy"], {})[row["recovery_policy"]] = float(row["rsr"]) / 100
-    return rows

@@ -1,4 +1,9 @@
-"""Does the order of policies from initial states hold at recovery points? Inversions, rho, tau, intervals."""
+"""Does the order of policies from initial states hold at recovery points? Inversions, rho, tau.
+
+What can be said for certain comes from the same evidence as every other verdict: pairs that are separated
+from both starts. A bootstrap of ranks is not used: it adds noise of its own to an order that is noisy
+already, and its intervals miss (`benchmarks/coverage.py --ranks`).
+"""
 
 from __future__ import annotations
 
@@ -9,8 +14,9 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
+from lerobot_roborecover.analysis.contrasts import contrasts
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
-from lerobot_roborecover.analysis.summary import Estimate
 
 
 @dataclass(frozen=True)
@@ -18,16 +24,19 @@ class RankAgreement:
     """How two orders of the same policies agree."""
 
     policies: int
-    inversions: int
-    """Pairs that the two orders put the other way round; a tie in either is no inversion."""
+    inversions: Estimate
+    """Pairs that the two orders put the other way round, a tie in either being none. Low: pairs shown to be
+    so from both starts; high: all pairs but those shown to be the same way round from both."""
     inverted: tuple[tuple[str, str], ...]
     """Those pairs: first the one that is higher initially."""
-    inversions_low: float
-    inversions_high: float
-    rho: Estimate
+    shown_same: int
+    """Pairs that are separated the same way from both starts."""
+    shown_inverted: int
+    """Pairs that are separated the other way round."""
+    rho: float
     """Spearman's; NaN with fewer than two policies or when one order has only ties."""
     tau: Estimate
-    """Kendall's tau-b."""
+    """Kendall's tau-b, with bounds from the same pairs."""
 
 
 def inverted_pairs(initial: Sequence[float], recovery: Sequence[float]) -> list[tuple[int, int]]:
@@ -48,24 +57,29 @@ def rank_agreement(
         initial: (P, N) rates; NaN where not run.
         recovery: (P, N) rates of the same policies on the same scenarios.
         names: P names.
-        resampling: of the N scenarios; one draw serves both orders.
+        resampling: of the N scenarios.
     """
     first, second = masked_mean(initial.T), masked_mean(recovery.T)
     pairs = inverted_pairs(first, second)
-    draws_first, draws_second = resampling.means(initial.T), resampling.means(recovery.T)
-    rho = _vectorised(stats.rankdata(draws_first, axis=1), stats.rankdata(draws_second, axis=1))
-    sign_first, sign_second = _pair_signs(draws_first), _pair_signs(draws_second)
-    tau = _vectorised(sign_first, sign_second, centre=False)
-    swaps = (sign_first * sign_second < 0).sum(1)[:, None].astype(float)
-    low, high = resampling.interval(np.stack([rho, tau, swaps[:, 0]], 1))
+    total = len(names) * (len(names) - 1) // 2
+    # Two families of verdicts must all hold at once: each gets half of the error.
+    error = (1 - resampling.level) / 2
+    shown = [
+        0 if c.p_holm != c.p_holm or c.p_holm >= error else int(np.sign(c.difference.value))
+        for rates in (initial, recovery)
+        for c in contrasts(rates, names, resampling)
+    ]
+    products = np.array(shown[:total]) * np.array(shown[total:])
+    same, other = int((products > 0).sum()), int((products < 0).sum())
+    low, high = (2 * same / total - 1, 1 - 2 * other / total) if total else (float("nan"), float("nan"))
     return RankAgreement(
         policies=len(names),
-        inversions=len(pairs),
+        inversions=Estimate(float(len(pairs)), float(other), float(total - same)),
         inverted=tuple((names[a], names[b]) for a, b in pairs),
-        inversions_low=float(low[2]),
-        inversions_high=float(high[2]),
-        rho=Estimate(_coefficient(stats.spearmanr, first, second), float(low[0]), float(high[0])),
-        tau=Estimate(_coefficient(stats.kendalltau, first, second), float(low[1]), float(high[1])),
+        shown_same=same,
+        shown_inverted=other,
+        rho=_coefficient(stats.spearmanr, first, second),
+        tau=Estimate(_coefficient(stats.kendalltau, first, second), low, high),
     )
 
 
@@ -73,16 +87,3 @@ def _coefficient(function, x: np.ndarray, y: np.ndarray) -> float:
     if len(x) < 2 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return float("nan")
     return float(function(x, y).statistic)
-
-
-def _pair_signs(values: np.ndarray) -> np.ndarray:
-    a, b = np.triu_indices(values.shape[1], 1)
-    return np.sign(values[:, a] - values[:, b])
-
-
-def _vectorised(x: np.ndarray, y: np.ndarray, centre: bool = True) -> np.ndarray:
-    """(draws,) correlations of (draws, K) rows; with pair signs and no centring this is Kendall's tau-b."""
-    if centre:
-        x, y = x - x.mean(1, keepdims=True), y - y.mean(1, keepdims=True)
-    scale = np.sqrt((x**2).sum(1) * (y**2).sum(1))
-    return np.divide((x * y).sum(1), scale, out=np.full(len(x), np.nan), where=scale > 0)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import importlib.resources
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -13,20 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.analysis.contrasts import contrasts
+from lerobot_roborecover.analysis.escape import markdown, markdown_alt
 from lerobot_roborecover.analysis.figures import all_figures
 from lerobot_roborecover.analysis.gallery import OUTCOME_CLASSES, SIGNS, Card, Clip, make_cards
+from lerobot_roborecover.analysis.headline import headline
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.page import grouped, picture, render_page
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.style import render
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.style import png_of, svg_of
 from lerobot_roborecover.analysis.tables import Table, to_csv, to_latex, to_markdown
+from lerobot_roborecover.analysis.units import ESTIMAND
 from lerobot_roborecover.whole import write_whole
 
 REPORT_SCHEMA = 1
 
 _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("overall", "forest", ("overall",)),
+    ("runs", "runs", ("methods", "runs", "method_contrasts")),
     ("ranks", "rank_transition", ("ranks",)),
     ("differences", "paired_differences", ("contrasts", "profiles")),
     ("cells", "cells", ("cells", "sources", "suites")),
@@ -41,6 +43,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 """Sections of the page: anchor, figure, tables. One without content is left out."""
 _HEADINGS = {
     "overall": "Recovery success",
+    "runs": "Methods and their runs",
     "ranks": "Initial states against recovery",
     "differences": "Which policies differ",
     "cells": "Where policies recover",
@@ -63,6 +66,10 @@ class Extras:
     clips: Mapping[str, Sequence[Clip]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     title: str = "Recovery report"
+    introduction: tuple[str, ...] = ()
+    """Paragraphs below the headline, for readers who know nothing of it."""
+    commands: tuple[str, ...] = ()
+    """What made the trials."""
     command: str = ""
     """What made the report."""
 
@@ -90,11 +97,11 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
     remarks = [*results.remarks, *extras.remarks]
     images: dict[str, dict[str, str]] = {}
     for figure in all_figures(results):
-        svg, png = render(figure)
-        write_whole(out / "figures" / f"{figure.name}.svg", svg)
-        write_whole(out / "figures" / f"{figure.name}.png", png)
-        uri = f"data:image/svg+xml;base64,{base64.b64encode(svg).decode()}"
-        images[figure.name] = {"uri": uri, "title": figure.title, "text": figure.description}
+        write_whole(out / "figures" / f"{figure.name}.svg", svg_of(figure.plot))
+        write_whole(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
+        if figure.narrow is not None:
+            write_whole(out / "figures" / f"{figure.name}_narrow.svg", svg_of(figure.narrow))
+        images[figure.name] = picture(figure)
     for table in tables:
         write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
         write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
@@ -103,32 +110,11 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
         out / "results.json", json.dumps(_as_json(results, tables, remarks, provenance), indent=1).encode()
     )
     write_whole(out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode())
-    cards = make_cards(results.recovery, extras.frames, extras.clips)
+    cards = make_cards(results.recovery, extras.frames, extras.clips, results.initial)
     write_whole(
         out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
     )
     return ReportFiles(out / "report.html", out / "report.md", out / "results.json", tuple(tables))
-
-
-def headline(results: Results) -> str:
-    """The result in a sentence or two."""
-    panel = results.recovery
-    rates = results.draws.estimates(panel.rates.T)
-    order = sorted(range(len(rates)), key=lambda p: (-rates[p].value, panel.arms[p]))
-    best = order[0]
-    rate = f"{100 * rates[best].value:.1f}"
-    start = f"{panel.arms[best]} recovers in {rate} % of its trials, averaged over scenarios"
-    if not math.isnan(rates[best].low):
-        low, high = 100 * rates[best].low, 100 * rates[best].high
-        start += f" ({100 * results.draws.level:g} % interval {low:.1f} to {high:.1f})"
-    if len(order) == 1:
-        return f"{start}."
-    pairs = [(best, p) for p in order[1:]]
-    found = contrasts(panel.rates, panel.arms, results.draws, pairs)
-    open_ones = [c.b for c in found if not c.difference.low > 0]
-    if not open_ones:
-        return f"{start}, and is separated from all {len(found)} other policies."
-    return f"{start}. Not separated from it with these trials: {', '.join(open_ones)}."
 
 
 def provenance_of(results: Results, command: str = "") -> dict[str, Any]:
@@ -151,12 +137,15 @@ def provenance_of(results: Results, command: str = "") -> dict[str, Any]:
         "trials_from": min(row.finished_at for row in rows),
         "trials_to": max(row.finished_at for row in rows),
         "bootstrap": {
-            "draws": len(results.draws.weights),
+            "draws": results.draws.draws,
             "seed": results.draws.seed,
             "level": results.draws.level,
             "unit": results.unit,
             "units": results.draws.units,
+            "estimand": ESTIMAND[results.recovery.unit(results.options.cluster)],
         },
+        "ranked": list(results.ranked.arms),
+        "ranked_scenarios": len(results.ranked.scenarios),
         "scheduled_trials": results.options.scheduled,
         "baseline": results.options.baseline,
     }
@@ -190,29 +179,23 @@ def _json_cell(cell: Any) -> Any:
 
 
 def _markdown(results, tables, images, remarks, provenance, extras: Extras) -> str:
-    lines = [f"# {extras.title}", "", headline(results), ""]
-    lines += [f"- {remark}" for remark in remarks] + [""] * bool(remarks)
+    lines = [f"# {markdown(extras.title, cell=True)}", "", markdown(headline(results)), ""]
+    lines += [f"- {markdown(remark)}" for remark in remarks] + [""] * bool(remarks)
     by_name = {table.name: table for table in tables}
     for _, figure, names in _SECTIONS:
         if figure in images:
-            text = images[figure]["text"].replace("[", "(").replace("]", ")")
-            lines += [f"![{text}](figures/{figure}.svg)", ""]
+            lines += [f"![{markdown_alt(images[figure]['text'])}](figures/{figure}.svg)", ""]
         lines += [to_markdown(by_name[name]) for name in names if name in by_name]
-    lines += ["## How this was made", "", "```json", json.dumps(provenance, indent=1), "```", ""]
+    lines += ["## How this was made", "", "```json", _fenced(json.dumps(provenance, indent=1)), "```", ""]
     return "\n".join(lines)
 
 
-def _html(results, tables, images, cards: list[Card], remarks, provenance, extras: Extras) -> str:
-    import jinja2
+def _fenced(text: str) -> str:
+    """Text for a fenced block, which three backticks would end."""
+    return text.replace("```", "` ` `")
 
-    source = (
-        importlib.resources.files("lerobot_roborecover.analysis")
-        .joinpath("report.html.j2")
-        .read_text("utf-8")
-    )
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+
+def _html(results, tables, images, cards: list[Card], remarks, provenance, extras: Extras) -> str:
     by_name = {table.name: table for table in tables}
     sections = [
         {
@@ -230,15 +213,21 @@ def _html(results, tables, images, cards: list[Card], remarks, provenance, extra
         "suite": sorted({card.suite for card in cards}),
     }
     present = {kind for card in cards for kind in card.outcome_classes}
-    return environment.from_string(source).render(
+    heads = {arm.title for arm in results.study.arms} | {str(path) for path in results.study.logs}
+    return render_page(
+        "report.html.j2",
         title=extras.title,
+        scripts=("gallery.js",),
         headline=headline(results),
-        remarks=remarks,
+        introduction=extras.introduction,
+        remarks=grouped(remarks, [*heads, *results.study.policies]),
         sections=sections,
         cards=cards,
+        both_starts=any(mark.initial for card in cards for mark in card.marks),
         choices=choices,
         outcome_classes={k: v for k, v in OUTCOME_CLASSES.items() if k in present},
         signs=SIGNS,
+        commands=extras.commands,
         provenance=json.dumps(provenance, indent=1),
         several=len(results.recovery.arms) > 1,
     )

@@ -7,32 +7,38 @@ from collections import Counter
 from itertools import combinations
 
 from lerobot_roborecover.analysis import published
-from lerobot_roborecover.analysis.contrasts import Contrast, contrasts, profile_difference, scenarios_needed
+from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
 from lerobot_roborecover.analysis.groups import (
     Group,
     group_rates,
     macro_estimates,
-    oracle,
-    ratio_estimates,
+    percentile_macro,
     source_matrix,
 )
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.ranking import rank_agreement
 from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
 from lerobot_roborecover.analysis.timing import FRACTIONS, budget_estimates, median_steps
+from lerobot_roborecover.analysis.units import ESTIMAND, Unit
 from lerobot_roborecover.analysis.variance import variance_split
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
 from lerobot_roborecover.scenario import Outcome
 
 _NAN = float("nan")
 _NOBODY = Estimate(_NAN, _NAN, _NAN)
+_VERDICTS = {v: v.value for v in Verdict} | {Verdict.A_BETTER: "helps", Verdict.B_BETTER: "harms"}
+"""Of an intervention against direct control."""
 
 
 def all_tables(results: Results) -> list[Table]:
     """Every table that the study has something for, in the order of the report."""
     tables = [overall(results), outcomes(results)]
+    if results.several_runs:
+        tables += runs_tables(results)
     if len(results.recovery.arms) > 1:
         tables.append(paired_contrasts(results))
         tables.append(profiles(results))
@@ -46,26 +52,31 @@ def all_tables(results: Results) -> list[Table]:
     tables += [budgets(results), variance(results)]
     if results.costs:
         tables.append(interventions(results))
-    tables.append(beside_published(results))
+    if published.policies(results.study.platform):
+        tables.append(beside_published(results))
     return tables
 
 
 def macro_title(panel: Panel) -> str:
-    """`Macro-9` where nine cells are occupied."""
+    """`Macro-9` where nine cells of the set are occupied."""
     return f"Macro-{len(panel.occupied('cell'))}"
 
 
 def overall(results: Results) -> Table:
-    """Initial rate, RSR, Macro, retention, and RSR without invalid trials."""
+    """Initial rate, RSR, Macro, retention, RSR without invalid trials; for other tasks; and as in the
+    paper."""
     panel, draws = results.recovery, results.draws
-    rsr, macro = draws.estimates(panel.rates.T), macro_estimates(panel, draws)
-    retention = ratio_estimates(panel.rates, results.initial_rates, draws)
+    rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
+    retention = draws.ratios(panel.rates.T, results.initial_rates.T)
     initial = initial_estimates(results)
     valid = masked_mean(panel.valid_rates.T)
+    tasks = rsr if results.tasks is None else results.tasks.rates(panel.rates.T)
+    paper, paper_macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws)
     rows = [
         (
             policy, initial[p], rsr[p], macro[p], retention[p], int((panel.trials[p] > 0).sum()),
-            int(panel.trials[p].sum()), int(panel.invalid[p].sum()), float(valid[p]),
+            int(panel.trials[p].sum()), int(panel.invalid[p].sum()), float(valid[p]), tasks[p], paper[p],
+            paper_macro[p] if not math.isnan(macro[p].value) else _NOBODY,
         )
         for p, policy in enumerate(panel.arms)
     ]  # fmt: skip
@@ -73,27 +84,46 @@ def overall(results: Results) -> Table:
         Column("Policy"), Column("Initial state %", "percent"), Column("RSR %", "percent"),
         Column(f"{macro_title(panel)} %", "percent"), Column("Retention", "ratio"), Column("Scenarios",
         "count"), Column("Trials", "count"), Column("Invalid", "count"), Column("RSR % without invalid",
-        "percent"),
+        "percent"), Column("RSR %, tasks like these", "percent"),
+        Column("RSR % (percentile bootstrap, as in the paper)", "percent"),
+        Column(f"{macro_title(panel)} % (percentile bootstrap, as in the paper)", "percent"),
     )  # fmt: skip
     notes = (
         "RSR: mean of the scenarios' success rates, each scenario counting the same. Macro: mean "
         "of the occupied "
-        "cells' rates. Retention: recovery over initial-state success on the same scenarios. "
+        "cells' rates, for policies with trials in all of them. Retention: recovery over initial-state "
+        "success on the same scenarios. "
         "Invalid trials count "
-        "as failures, except in the last column, where they and scenarios without a valid trial "
+        "as failures, except under “RSR % without invalid”, where they and scenarios without a valid trial "
         "are left out.",
-        f"[{100 * draws.level:g} % intervals]: percentile bootstrap over {draws.units} {results.unit}, "
-        f"{len(draws.weights)} draws, seed {draws.seed}.",
+        f"[{100 * draws.level:g} % intervals] of rates: Agresti-Coull with the effective number of "
+        f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not (docs/report.md); "
+        f"they speak of {ESTIMAND[panel.unit(results.options.cluster)]}. {_of_tasks(results)}Percentile "
+        f"bootstrap, as in the paper: {draws.draws} draws, seed {draws.seed}, to compare with the paper.",
     )
     return Table("overall", "Overall results", columns, tuple(rows), notes)
 
 
-def initial_estimates(results: Results) -> list[Estimate]:
-    """Initial-state rate of every policy over all its initial trials; undefined for one without."""
+def _of_tasks(results: Results) -> str:
+    tasks = results.tasks
+    if tasks is None:
+        return ""
+    return f"Tasks like these: the same over the {tasks.units} tasks, for {ESTIMAND[Unit.TASK]}. "
+
+
+def initial_estimates(results: Results, *, as_in_the_paper: bool = False) -> list[Estimate]:
+    """Initial-state rate of every policy over all its initial trials; undefined for one without.
+
+    Args:
+        results: the study.
+        as_in_the_paper: with the paper's percentile bootstrap.
+    """
     panel = results.initial
     if panel is None:
         return [_NOBODY for _ in results.recovery.arms]
-    found = dict(zip(panel.arms, results.resample(panel).estimates(panel.rates.T), strict=True))
+    draws = results.resample(panel)
+    estimates = (draws.percentile if as_in_the_paper else draws.rates)(panel.rates.T)
+    found = dict(zip(panel.arms, estimates, strict=True))
     return [found.get(policy, _NOBODY) for policy in results.recovery.arms]
 
 
@@ -101,7 +131,7 @@ def outcomes(results: Results) -> Table:
     """Trials by outcome, policy and start."""
     kinds = [o for o in Outcome if any(r.outcome == o for arm in results.study.arms for r in arm.rows)]
     rows = []
-    for arm in results.study.arms:
+    for arm in results.arms:
         counts = Counter(row.outcome for row in arm.rows)
         rows.append((arm.policy, arm.start.value, len(arm.rows), *(counts[k.value] for k in kinds)))
     columns = (
@@ -113,69 +143,94 @@ def outcomes(results: Results) -> Table:
 
 
 def paired_contrasts(results: Results) -> Table:
-    """All pairs: difference from both starts, adjusted p, scenarios that would separate them."""
-    panel, draws = results.recovery, results.draws
-    recovery = contrasts(panel.rates, panel.arms, draws)
-    initial = contrasts(results.initial_rates, panel.arms, draws)
+    """All pairs: difference from both starts, adjusted p, verdict."""
+    tasks = _task_differences(results)
     rows = [
-        (c.a, c.b, i.difference, c.difference, c.p, c.p_holm, c.scenarios, _needed(c, draws.level))
-        for c, i in zip(recovery, initial, strict=True)
-    ]
+        (
+            c.a, c.b, i.difference, c.difference, c.p, c.p_holm, c.verdict.value, c.scenarios, c.differing,
+            t,
+        )
+        for c, i, t in zip(results.contrasts, results.initial_contrasts, tasks, strict=True)
+    ]  # fmt: skip
     columns = (
         Column("A"), Column("B"), Column("Initial state, A − B", "points"), Column("RSR, A − B", "points"),
-        Column("p", "p"), Column("p (Holm)", "p"), Column("Scenarios", "count"), Column("To separate",
-        "text"),
+        Column("p", "p"), Column("p (Holm)", "p"), Column("Verdict"), Column("Scenarios", "count"),
+        Column("Differing", "count"),
+        Column("RSR, A − B, tasks like these", "points"),
     )  # fmt: skip
+    family = max((c.family for c in results.contrasts), default=0)
+    level = results.options.level
     notes = (
-        "Percentage points, over the scenarios that both were run on, all pairs on the same draws. "
-        "Intervals are not "
-        "adjusted; p (Holm) is, for all pairs of this table.",
-        "To separate: scenarios at which the interval would leave out zero with 80 % chance, were "
-        "the difference as "
-        "observed.",
+        "Percentage points, over the scenarios that both were run on. Intervals are not adjusted; p (Holm) "
+        f"is, for the {family} pairs of complete policies. p: paired sign-flip permutation test over "
+        f"{results.unit}.",
+        f"Verdict: p (Holm) below {1 - level:.3g}, and at least {LEAST_DIFFERING} {results.unit} on which "
+        "the two differ; incomplete policies have none.",
+        *_watched_note(results),
     )
     return Table("contrasts", "Paired differences", columns, tuple(rows), notes)
 
 
-def _needed(contrast: Contrast, level: float) -> str:
-    if contrast.difference.low > 0 or contrast.difference.high < 0:
-        return "separated"
-    needed = scenarios_needed(contrast, level)
-    return "no difference" if needed is None else f"about {needed}"
+def _watched_note(results: Results) -> list[str]:
+    """Which pairs have the sequential test."""
+    pairs = [f"{c.a}, {c.b}" for c in results.contrasts if c.sequential]
+    if not pairs:
+        return []
+    return [
+        f"Watched while they ran, with p and interval of the sequential test ({'; '.join(pairs)}): they hold "
+        "at every look, on the scenarios whose turn had come."
+    ]
+
+
+def _task_differences(results: Results) -> list[Estimate]:
+    """The contrasts' differences with intervals over tasks."""
+    panel = results.recovery
+    found = []
+    for c in results.contrasts:
+        own = results.ranked if {c.a, c.b} <= set(results.ranked.arms) else panel
+        draws = results.resample(own, Unit.TASK)
+        values = own.rates[own.arm(c.a)] - own.rates[own.arm(c.b)]
+        found += draws.differences(values[:, None])
+    return found
 
 
 def profiles(results: Results) -> Table:
-    """Mean absolute profile difference of every pair."""
+    """Profile difference of every pair: cross-fitted, in hindsight, and by chance alone."""
     panel, draws = results.recovery, results.draws
     rows = []
     for a, b in combinations(range(len(panel.arms)), 2):
-        estimate, higher, lower, ties = profile_difference(panel.rates[a], panel.rates[b], draws)
-        rows.append((panel.arms[a], panel.arms[b], estimate, higher, lower, ties))
+        w = profile_difference(panel, a, b, draws)
+        rows.append(
+            (panel.arms[a], panel.arms[b], w.difference, w.hindsight, w.floor, w.higher, w.lower, w.equal)
+        )
     columns = (
-        Column("A"), Column("B"), Column("Profile difference", "points"), Column("A higher", "count"),
+        Column("A"), Column("B"), Column("Profile difference, cross-fitted", "points"),
+        Column("as observed", "points"), Column("by chance alone", "points"), Column("A higher", "count"),
         Column("B higher", "count"), Column("Equal", "count"),
     )  # fmt: skip
     notes = (
-        "Mean absolute difference of the scenario rates, in points: how differently two policies "
-        "do, whatever their "
-        "RSR. Few trials per scenario raise it also between equal policies.",
+        "How differently two policies do scenario by scenario, whatever their RSR. Cross-fitted: the sign of "
+        "each scenario's difference from half of its trials, the size from the other half; zero on average "
+        "for policies that are alike. As observed: mean absolute difference, which noise makes larger than "
+        "zero. By chance alone: what that would be were the two alike (mean, and what 95 % of random deals "
+        "of the trials show).",
     )
     return Table("profiles", "Profile differences", columns, tuple(rows), notes)
 
 
 def ranks(results: Results) -> Table:
     """Agreement of the orders from initial states and from recovery points."""
-    index = results.matched
-    found = rank_agreement(
-        results.initial_rates[index], results.recovery.rates[index], [results.recovery.arms[p] for p in
-        index], results.draws
-    )  # fmt: skip
+    found = rank_agreement(*results.both_starts)
     inverted = "; ".join(f"{a} over {b}" for a, b in found.inverted) or "none"
-    swaps = Estimate(float(found.inversions), found.inversions_low, found.inversions_high)
     rows: list[tuple[Cell, ...]] = [
-        ("Rank inversions", swaps), ("Spearman's rho", found.rho), ("Kendall's tau", found.tau)
+        ("Rank inversions", found.inversions), ("Spearman's rho", found.rho), ("Kendall's tau", found.tau)
     ]  # fmt: skip
-    notes = (f"{found.policies} policies. Order from initial states that recovery inverts: {inverted}.",)
+    pairs = found.policies * (found.policies - 1) // 2
+    notes = (
+        f"{found.policies} policies. Order from initial states that recovery inverts: {inverted}. Of {pairs} "
+        f"pairs, {found.shown_inverted} are separated from both starts and the other way round, "
+        f"{found.shown_same} the same way round; the bounds let all others be either.",
+    )
     return Table(
         "ranks",
         "Initial-state order against recovery order",
@@ -204,7 +259,7 @@ def grouped(results: Results, label: str, name: str, title: str, heading: str) -
         title,
         columns,
         tuple(rows),
-        ("RSR in %, N scenarios; intervals resample within the group.",),
+        ("RSR in %, N scenarios; intervals are over the group's own scenarios.",),
         sparse,
     )
 
@@ -220,34 +275,45 @@ def sources_by_policy(results: Results) -> Table:
     rows = []
     for row in found:
         best = panel.arms[row.best_other] if row.best_other is not None else "none"
-        rows.append((row.source_policy, row.scenarios, *row.rates, best, row.gain or _NOBODY))
+        rows.append(
+            (row.source_policy, row.scenarios, *row.rates, best, row.gain or _NOBODY, row.hindsight_gain)
+        )
     columns = (
         Column("Source policy"), Column("N", "count"), *(Column(p, "percent") for p in panel.arms),
-        Column("Observed best other"), Column("Its gain", "points"),
+        Column("Observed best other"), Column("Gain, cross-fitted", "points"),
+        Column("Gain in hindsight", "points"),
     )  # fmt: skip
     notes = (
-        "Natural scenarios, by the policy whose rollout led to them. Gain: observed-best other "
-        "policy minus the source "
-        "policy itself; the best is chosen on the same trials, so it is optimistic.",
+        "Natural scenarios, by the policy whose rollout led to them. Gain: best other policy minus the "
+        "source policy itself. Cross-fitted: the best is chosen on half of the trials (half of the "
+        "scenarios, where trials are single) and scored on the other half. In hindsight: the observed best, "
+        "chosen and scored on the same trials, and so too high.",
     )
     sparse = frozenset(i for i, row in enumerate(found) if row.underpowered)
     return Table("source_matrix", "Source policy × recovery policy", columns, tuple(rows), notes, sparse)
 
 
 def oracle_table(results: Results) -> Table:
-    """Retrospective oracle."""
-    found = oracle(results.recovery, results.draws)
+    """Oracle: cross-fitted, in hindsight, and by chance alone."""
+    found = oracle(results.ranked, results.ranked_draws)
     rows = (
-        ("Oracle (best observed policy per scenario)", found.rate),
-        (f"Best fixed policy ({found.best_policy})", found.best_rate),
+        ("Best policy of each scenario, chosen on half of the trials, scored on the other", found.rate),
+        ("Best policy of all, chosen and scored the same way", found.fixed),
         ("Difference", found.gain),
+        ("Best observed policy of each scenario, in hindsight", found.hindsight),
+        (f"Best policy of all ({found.best_policy})", found.best_rate),
+        ("Difference in hindsight", found.hindsight_gain),
+        ("Difference in hindsight by chance alone", found.floor),
     )
     lost = ", ".join(found.no_success[:5]) + (", ..." if len(found.no_success) > 5 else "")
     notes = (
-        f"Chosen with the outcomes in hand: not a method that could be deployed. No policy ever solved "
-        f"{len(found.no_success)} of {found.scenarios} scenarios{f' ({lost})' if lost else ''}.",
+        "In hindsight the best is chosen and scored on the same trials, which is too high, and no method "
+        "that could be deployed. By chance alone: what it would be were the policies alike (mean, and what "
+        "95 % of random deals of the trials show). Choosing on half takes two trials of each scenario. No "
+        f"policy ever solved {len(found.no_success)} of {found.scenarios} "
+        f"scenarios{f' ({lost})' if lost else ''}.",
     )
-    return Table("oracle", "Retrospective oracle", (Column("What"), Column("RSR %", "percent")), rows, notes)
+    return Table("oracle", "Oracle", (Column("What"), Column("RSR %", "percent")), rows, notes)
 
 
 def budgets(results: Results) -> Table:
@@ -303,14 +369,16 @@ def interventions(results: Results) -> Table:
     kinds = sorted({kind for cost in results.costs for kind in cost.per_trial})
     rows = [
         (
-            c.arm, c.baseline, c.scenarios, c.direct, c.with_intervention, c.gain, c.extra_steps, c.triggered,
+            c.arm, c.baseline, c.scenarios, c.direct, c.with_intervention, c.gain, d.p, d.p_holm,
+            _VERDICTS[d.verdict], c.extra_steps, c.triggered,
             *(c.per_trial.get(kind, 0.0) for kind in kinds), c.matched, c.rescued, c.harmed,
         )
-        for c in results.costs
+        for c, d in zip(results.costs, results.procedure_contrasts, strict=True)
     ]  # fmt: skip
     columns = (
         Column("Intervention"), Column("Direct control"), Column("Scenarios", "count"),
         Column("Direct RSR %", "percent"), Column("RSR %", "percent"), Column("Gain", "points"),
+        Column("p", "p"), Column("p (Holm)", "p"), Column("Verdict"),
         Column("Extra steps per trial", "number"), Column("Triggered %", "percent"),
         *(Column(f"{kind} per trial", "ratio") for kind in kinds),
         Column("Matched trials", "count"), Column("Rescued", "count"), Column("Harmed", "count"),
@@ -320,7 +388,8 @@ def interventions(results: Results) -> Table:
         "a controller. "
         "Matched trials share scenario and trial index. Rescued: direct control fails, the "
         "intervention solves. "
-        "Harmed: direct control solves, the intervention loses.",
+        "Harmed: direct control solves, the intervention loses. p (Holm): for the interventions of this "
+        "table, each against its direct control.",
     )
     return Table("interventions", "Interventions against direct control", columns, tuple(rows), notes)
 
@@ -328,34 +397,32 @@ def interventions(results: Results) -> Table:
 def beside_published(results: Results) -> Table:
     """This study's policies beside the paper's twelve rows and LIBERO-Plus."""
     panel, draws = results.recovery, results.draws
-    rsr, macro, initial = (
-        draws.estimates(panel.rates.T),
-        macro_estimates(panel, draws),
-        initial_estimates(results),
-    )
+    rsr, macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws)
+    whole = macro_estimates(panel, draws)
+    macro = [m if not math.isnan(w.value) else _NOBODY for m, w in zip(macro, whole, strict=True)]
+    initial = initial_estimates(results, as_in_the_paper=True)
     rows: list[tuple[Cell, ...]] = [
-        (policy, results.study.platform, "this report", initial[p], rsr[p], macro[p], None)
-        for p, policy in enumerate(panel.arms)
+        (policy, "this report", initial[p], rsr[p], macro[p], None) for p, policy in enumerate(panel.arms)
     ]
-    own = results.study.platform
-    with_plus = {row.policy for row in published.policies("libero") if row.libero_plus is not None}
     remarks = []
-    for row in sorted(published.policies(), key=lambda r: (r.platform != own, r.platform)):
+    for row in published.policies(results.study.platform):
         plus: Cell = row.libero_plus
         if plus is None:
-            plus = "see libero" if row.platform != "libero" and row.policy in with_plus else "not published"
+            plus = "not published"
         elif row.libero_plus_note:
             remarks.append(f"{row.policy} ({row.platform}): {row.libero_plus_note}")
-        rows.append((row.policy, row.platform, "published", row.initial, row.rsr, row.macro9, plus))
+        rows.append((row.policy, "published", row.initial, row.rsr, row.macro9, plus))
+    rows.sort(key=lambda cells: -cells[3].value)
     columns = (
-        Column("Policy"), Column("Platform"), Column("Origin"), Column("Initial state %", "percent"),
+        Column("Policy"), Column("Origin"), Column("Initial state %", "percent"),
         Column("RSR %", "percent"), Column("Macro %", "percent"), Column("LIBERO-Plus %", "percent"),
     )  # fmt: skip
+    said = f" ({'; '.join(remarks)})" if remarks else ""
     notes = (
+        "All intervals are percentile bootstraps, as in the paper. "
         "Published rows are the paper's, not re-run here. They are comparable with this report "
         "only where its trials "
-        "are on the paper's 200 test scenarios of the same platform. LIBERO-Plus: totals published "
-        "by others, another "
-        f"benchmark ({'; '.join(remarks)}).",
+        "are on the paper's 200 test scenarios of the platform. LIBERO-Plus: totals published by others, "
+        f"another benchmark{said}.",
     )
     return Table("published", "Beside the published results", columns, tuple(rows), notes)

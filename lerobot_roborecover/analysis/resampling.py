@@ -1,29 +1,97 @@
-"""The bootstrap: one set of draws for all numbers of a report, so that differences are paired."""
+"""One sampling for all numbers of a report: what is independent, the intervals over it, and the bootstrap's
+draws.
+
+The intervals that are printed are those of `intervals.py`. The bootstrap gives the paper's own columns and
+the spread of what has no formula (orders of policies); one set of draws serves all of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import DRAWS, LEVEL
-from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.estimators import DRAWS, draw_counts
+from lerobot_roborecover.analysis.intervals import (
+    LEVEL,
+    Bounds,
+    Estimate,
+    Spread,
+    clean,
+    difference_interval,
+    rate_interval,
+    ratio_interval,
+    spread,
+)
 
+_DRAWS_AT_ONCE = 1000
 SEED = 0
 """Seed of the draws unless another is asked for; the same as the demo's table uses."""
 
 
 @dataclass(frozen=True)
 class Resampling:
-    """Percentile bootstrap over units (scenarios, or trajectory clusters) of N scenarios."""
+    """N scenarios in their units (scenarios, trajectory clusters, or tasks), at one level of confidence."""
 
-    weights: np.ndarray
-    """(draws, N) float64: how often each scenario occurs in each draw."""
+    index: np.ndarray
+    """(N,) int: every scenario's unit."""
     units: int
+    draws: int
     seed: int
     level: float = LEVEL
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(draws, N) float64: how often each scenario occurs in each draw of the bootstrap."""
+        if not self.units:
+            return np.zeros((self.draws, 0))
+        return _counts(self.units, self.draws, self.seed)[:, self.index].astype(float)
+
+    def part(self, scenarios: np.ndarray) -> Resampling:
+        """Of some of the scenarios, by index, with the same draws, seed and level."""
+        return resample(self.index[scenarios], self.draws, self.seed, self.level)
+
+    def rates(self, values: np.ndarray, *, cells: np.ndarray | None = None, weights=None) -> list[Estimate]:
+        """Mean of each of (N, K) columns of numbers from 0 to 1, with its interval.
+
+        Args:
+            values: NaN where a scenario has none.
+            cells: (N,) labels: the mean is that of the cells' means (Macro).
+            weights: (N, K) of the scenarios, by default all the same: a column is then a ratio of sums.
+        """
+        return self._columns(rate_interval, values, cells, weights)
+
+    def differences(self, values: np.ndarray) -> list[Estimate]:
+        """Mean of each of (N, K) columns of paired differences of rates, with its interval."""
+        return self._columns(difference_interval, values)
+
+    def ratios(self, top: np.ndarray, bottom: np.ndarray) -> list[Estimate]:
+        """Ratio of the means of each of (N, K) columns on the scenarios that have both, with Fieller's
+        interval.
+
+        NaN where the lower mean is zero.
+        """
+        both = np.isfinite(top) & np.isfinite(bottom)
+        upper, lower = (np.where(both, rates, 0.0).sum(0) for rates in (top, bottom))
+        values = np.divide(upper, lower, out=np.full(len(lower), np.nan), where=lower > 0)
+        return _estimates(values, *ratio_interval(top.T, bottom.T, self.index, self.level))
+
+    def spread(self, values: np.ndarray, cells: np.ndarray | None = None) -> Spread:
+        """Of (..., N) values: one column of scenarios, or several."""
+        return spread(values, self.index, cells=cells)
+
+    def _columns(
+        self,
+        interval: Callable[[Spread, float], Bounds],
+        values: np.ndarray,
+        cells: np.ndarray | None = None,
+        weights: np.ndarray | None = None,
+    ) -> list[Estimate]:
+        own = None if weights is None else weights.T
+        columns = spread(values.T, self.index, cells=cells, weights=own)
+        return _estimates(columns.value, *interval(columns, self.level))
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Means of every draw over the scenarios that have a value.
@@ -35,10 +103,19 @@ class Resampling:
             (draws, K); NaN for a draw without any such scenario.
         """
         known = np.isfinite(values)
-        total = self.weights @ np.where(known, values, 0.0)
-        mass = self.weights @ known if not known.all() else self.weights.sum(1, keepdims=True)
-        mass = np.broadcast_to(mass, total.shape)
-        return np.divide(total, mass, out=np.full(total.shape, np.nan), where=mass > 0)
+        if not self.units:
+            return np.full((self.draws, values.shape[1]), np.nan)
+        # Sums by unit first: a draw takes whole units, and its counts are small numbers in few bytes.
+        sums, sizes = np.zeros((2, self.units, values.shape[1]))
+        np.add.at(sums, self.index, np.where(known, values, 0.0))
+        np.add.at(sizes, self.index, known)
+        found = np.full((self.draws, values.shape[1]), np.nan)
+        counts = _counts(self.units, self.draws, self.seed)
+        for first in range(0, self.draws, _DRAWS_AT_ONCE):
+            part = counts[first : first + _DRAWS_AT_ONCE].astype(float)
+            mass = part @ sizes
+            np.divide(part @ sums, mass, out=found[first : first + len(part)], where=mass > 0)
+        return found
 
     def interval(self, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Percentile bounds of (draws, K) values; NaN with fewer than two units, or no value at all."""
@@ -56,19 +133,31 @@ class Resampling:
                 bounds[:, k] = np.quantile(column, levels)
         return bounds[0], bounds[1]
 
-    def estimates(self, values: np.ndarray) -> list[Estimate]:
-        """Mean and interval of each of (N, K) columns; no interval for fewer than two scenarios."""
+    def percentile(self, values: np.ndarray) -> list[Estimate]:
+        """The paper's estimates: mean and percentile bootstrap of each of (N, K) columns.
+
+        No interval for fewer than two scenarios. For the columns that are compared with the paper; intervals
+        that cover are `rates` and `differences`.
+        """
         count = np.isfinite(values).sum(0)
         low, high = self.interval(self.means(values))
         points = masked_mean(values)
         return [
-            Estimate(float(p), float(a), float(b)) if n > 1 else Estimate(float(p), np.nan, np.nan)
+            Estimate(float(p), float(clean(a)), float(clean(b)))
+            if n > 1
+            else Estimate(float(p), np.nan, np.nan)
             for p, a, b, n in zip(points, low, high, count, strict=True)
         ]
 
 
-def resample(units: Sequence[str], draws: int = DRAWS, seed: int = SEED, level: float = LEVEL) -> Resampling:
-    """Draws the weights.
+def _estimates(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Estimate]:
+    return [Estimate(*bounds) for bounds in zip(values.tolist(), low.tolist(), high.tolist(), strict=True)]
+
+
+def resample(
+    units: Sequence[str] | np.ndarray, draws: int = DRAWS, seed: int = SEED, level: float = LEVEL
+) -> Resampling:
+    """Sorts scenarios into their units.
 
     Args:
         units: N labels; scenarios that share one are drawn together.
@@ -77,18 +166,17 @@ def resample(units: Sequence[str], draws: int = DRAWS, seed: int = SEED, level: 
         level: confidence level.
     """
     index = np.unique(np.asarray(units), return_inverse=True)[1]
-    count = int(index.max()) + 1 if len(index) else 0
-    if not count:
-        return Resampling(np.zeros((draws, 0)), 0, seed, level)
-    weights = _counts(count, draws, seed)[:, index]
-    return Resampling(weights.astype(float), count, seed, level)
+    return Resampling(index, int(index.max()) + 1 if len(index) else 0, draws, seed, level)
 
 
 @lru_cache(maxsize=32)
 def _counts(units: int, draws: int, seed: int) -> np.ndarray:
     """(draws, units) how often each unit is drawn; tables and figures ask for the same ones again."""
-    drawn = np.random.default_rng(seed).multinomial(units, np.full(units, 1 / units), size=draws)
-    counts = drawn.astype(np.uint16 if units < 2**16 else np.int64)
+    rng = np.random.default_rng(seed)
+    counts = np.empty((draws, units), np.uint16 if units < 2**16 else np.int64)
+    for first in range(0, draws, _DRAWS_AT_ONCE):  # the same draws as all at once, in a tenth of the memory
+        part = counts[first : first + _DRAWS_AT_ONCE]
+        part[:] = draw_counts(rng, units, len(part))
     counts.setflags(write=False)
     return counts
 

@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.compared import Compared, compared
+from lerobot_roborecover.analysis.contrasts import Contrast, adjusted, contrasts
 from lerobot_roborecover.analysis.costs import InterventionCost, intervention_cost
-from lerobot_roborecover.analysis.estimators import DRAWS, LEVEL, RowsError
+from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
 from lerobot_roborecover.analysis.logs import Arm, Study
 from lerobot_roborecover.analysis.panel import Panel, make_panel
-from lerobot_roborecover.analysis.resampling import SEED, Resampling, resample
+from lerobot_roborecover.analysis.resampling import SEED, Resampling, masked_mean, resample
+from lerobot_roborecover.analysis.runs import (
+    MethodContrast,
+    MethodRate,
+    RunRates,
+    method_contrasts,
+    method_rate,
+    run_rates,
+)
+from lerobot_roborecover.analysis.units import WORDS, Unit
+from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
 
 
@@ -29,12 +43,20 @@ class Options:
     """Direct control that interventions are compared with; by default the same policy, or the only one."""
     interventions: tuple[str, ...] = ()
     """Policies to treat as interventions although none of their trials shows one."""
+    cluster: Unit | None = None
+    """What intervals and tests take as independent; by default what the paper resamples on the platform."""
+    common: bool = False
+    """Rank all policies, on the scenarios common to all; by default those that are complete."""
+    sequential: bool = False
+    """Whether all pairs are tested so that the logs may be looked at while they grow."""
 
     def __post_init__(self):
         if self.draws < 100:
             raise RowsError(
                 f"--draws={self.draws} bootstrap draws cannot give an interval; take at least 100"
             )
+        if self.cluster is not None and self.cluster not in list(Unit):
+            raise RowsError(f"--cluster={self.cluster} is not one of {', '.join(Unit)}")
         if not 0.5 <= self.level < 1:
             raise RowsError(f"--level={self.level} is not a confidence level from 0.5 to 1")
         if self.scheduled is not None and self.scheduled < 1:
@@ -62,9 +84,178 @@ class Results:
         """Of the recovery panel's scenarios; shared by every number of the report on them."""
         return self.resample(self.recovery)
 
-    def resample(self, panel: Panel) -> Resampling:
-        """Draws of another panel's scenarios, with the same seed and level."""
-        return resample(panel.units(), self.options.draws, self.options.seed, self.options.level)
+    def resample(self, panel: Panel, unit: Unit | None = None) -> Resampling:
+        """Units of another panel's scenarios, with the same draws, seed and level."""
+        o = self.options
+        return resample(panel.units(unit or o.cluster), o.draws, o.seed, o.level)
+
+    @cached_property
+    def compared(self) -> Compared:
+        """Which policies are ranked, on which scenarios."""
+        return _compared(self.recovery, self._direct, self.options)
+
+    @cached_property
+    def _direct(self) -> list[Arm]:
+        """The arms of the recovery panel, in its order."""
+        of = {arm.title: arm for arm in self.study.of(Start.RECOVERY)}
+        return [of[title] for title in self.recovery.arms]
+
+    @cached_property
+    def ranked(self) -> Panel:
+        """The complete policies on the scenarios that all of them were run on: headline, ranking, oracle."""
+        return self.recovery.take(self.compared.policies, self.compared.scenarios)
+
+    @cached_property
+    def ranked_draws(self) -> Resampling:
+        """Of the ranked panel's scenarios."""
+        return self.resample(self.ranked)
+
+    @cached_property
+    def ranked_rates(self) -> list[Estimate]:
+        """RSR of every ranked policy."""
+        return self.ranked_draws.rates(self.ranked.rates.T)
+
+    @cached_property
+    def best_first(self) -> list[int]:
+        """Indices of the ranked policies, highest RSR first."""
+        rates, names = self.ranked_rates, self.ranked.arms
+        return sorted(range(len(rates)), key=lambda p: (-rates[p].value, names[p]))
+
+    @property
+    def arms(self) -> list[Arm]:
+        """All arms of the study, policies best first, interventions after them; starts together."""
+        place = {policy: k for k, policy in enumerate(self.recovery.arms)}
+        return sorted(self.study.arms, key=lambda arm: place.get(arm.policy, len(place)))
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Policies that are not ranked."""
+        return tuple(a for p, a in enumerate(self.recovery.arms) if p not in self.compared.policies)
+
+    @cached_property
+    def tasks(self) -> Resampling | None:
+        """The recovery panel's scenarios by task, for what holds of other tasks; None where units are
+        tasks."""
+        if self.recovery.unit(self.options.cluster) is Unit.TASK:
+            return None
+        return self.resample(self.recovery, Unit.TASK)
+
+    @cached_property
+    def contrasts(self) -> tuple[Contrast, ...]:
+        """All pairs of policies. Those of ranked ones are one family, on the ranked scenarios."""
+        chosen, count = self.compared.policies, len(self.recovery.arms)
+        inside = {
+            (chosen[k], chosen[m]): c
+            for (k, m), c in zip(
+                combinations(range(len(chosen)), 2),
+                contrasts(self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit),
+                strict=True,
+            )
+        }
+        pairs = list(combinations(range(count), 2))
+        outside = [pair for pair in pairs if pair not in inside]
+        found = inside | dict(
+            zip(
+                outside,
+                contrasts(
+                    self.recovery.rates,
+                    self.recovery.arms,
+                    self.draws,
+                    outside,
+                    unit=self.unit,
+                    complete=False,
+                ),
+                strict=True,
+            )
+        )
+        return tuple(adjusted([self._watched(pair) or found[pair] for pair in pairs]))
+
+    def _watched(self, pair: tuple[int, int]) -> Contrast | None:
+        """The sequential contrast of a pair whose comparison was watched, or is to be; None for others."""
+        panel, level = self.recovery, self.options.level
+        for indices in (pair, (pair[1], pair[0])):
+            record = self._records.get((panel.arms[indices[0]], panel.arms[indices[1]]))
+            if record is not None:
+                found = watched_pair(
+                    panel, indices, level,
+                    scenarios=record.scenarios, trials=record.trials, planned_level=record.level,
+                )  # fmt: skip
+                return found if indices == pair else found.turned()
+        return watched_pair(panel, pair, level) if self.options.sequential else None
+
+    @cached_property
+    def _records(self):
+        return recorded_pairs(self.study.sequential, self._direct)
+
+    @cached_property
+    def runs(self) -> tuple[RunRates, ...]:
+        """Every policy's runs on the recovery panel; one run where it is no method of several."""
+        panel, scheduled = self.recovery, self.options.scheduled
+        return tuple(run_rates(arm, panel, p, scheduled) for p, arm in enumerate(self._direct))
+
+    @property
+    def several_runs(self) -> bool:
+        """Whether any policy is a method of several runs."""
+        return any(len(found.runs) > 1 for found in self.runs)
+
+    @cached_property
+    def method_rates(self) -> tuple[MethodRate, ...]:
+        """Rate, spread and interval of every method, in the recovery panel's order."""
+        return tuple(method_rate(found, self.draws) for found in self.runs)
+
+    @cached_property
+    def method_contrasts(self) -> tuple[MethodContrast, ...]:
+        """The pairs of `contrasts`, said of the methods behind the runs."""
+        return method_contrasts(self.contrasts, self.runs, self.recovery, self.draws)
+
+    @cached_property
+    def initial_contrasts(self) -> tuple[Contrast, ...]:
+        """The same pairs from initial states, on the same scenarios; a family of their own."""
+        keep = np.zeros(self.recovery.rates.shape, bool)
+        keep[np.ix_(self.compared.policies, self.compared.scenarios)] = True
+        keep[[p for p, arm in enumerate(self.recovery.arms) if arm in self.left_out]] = True
+        rates = np.where(keep, self.initial_rates, np.nan)
+        return tuple(contrasts(rates, self.recovery.arms, self.draws, unit=self.unit))
+
+    @cached_property
+    def procedure_contrasts(self) -> tuple[Contrast, ...]:
+        """Every intervention minus its direct control, in the order of `intervention_pairs`: one family."""
+        panel = self.interventions
+        if panel is None:
+            return ()
+        pairs = [(arm, base) for base, arm in self.intervention_pairs]
+        draws = self.resample(panel)
+        run = panel.trials > 0
+        whole = [bool((run[a] == run[b]).all()) for a, b in pairs]
+        inside = [pair for pair, ok in zip(pairs, whole, strict=True) if ok]
+        outside = [pair for pair, ok in zip(pairs, whole, strict=True) if not ok]
+        found = {
+            pair: c
+            for some, ok in ((inside, True), (outside, False))
+            for pair, c in zip(
+                some,
+                contrasts(panel.rates, panel.arms, draws, some, unit=self.unit, complete=ok),
+                strict=True,
+            )
+        }
+        return tuple(found[pair] for pair in pairs)
+
+    def contrast(self, a: str, b: str) -> Contrast:
+        """The contrast of two policies, or of an intervention and its direct control, a minus b.
+
+        Raises:
+            RowsError: it is no question of a family: an intervention against another policy, or another
+            intervention.
+        """
+        for c in (*self.contrasts, *self.procedure_contrasts):
+            if (c.a, c.b) == (a, b):
+                return c
+            if (c.a, c.b) == (b, a):
+                return c.turned()
+        raise RowsError(
+            f"{a} against {b} is no one question: policies are compared with policies, and an intervention "
+            "with its own direct control (--baseline says which)"
+        )
 
     @cached_property
     def initial_rates(self) -> np.ndarray:
@@ -82,10 +273,26 @@ class Results:
         return rates
 
     @cached_property
-    def matched(self) -> list[int]:
-        """Indices of the policies with both arms on at least one common scenario."""
+    def _matched(self) -> Compared:
+        """Ranked policies and scenarios with trials from both starts, a complete table again."""
         both = np.isfinite(self.initial_rates) & np.isfinite(self.recovery.rates)
-        return [int(p) for p in np.flatnonzero(both.any(1))]
+        keep = np.zeros(both.shape, bool)
+        keep[np.ix_(self.compared.policies, self.compared.scenarios)] = True
+        return compared(both & keep, self.recovery.arms)
+
+    @property
+    def matched(self) -> list[int]:
+        """Indices of the ranked policies with trials from both starts on the same scenarios."""
+        return list(self._matched.policies) if self._matched.scenarios else []
+
+    @property
+    def both_starts(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], Resampling]:
+        """Initial-state and recovery rates of the matched policies on the scenarios that all have; names;
+        units."""
+        index = np.ix_(self.matched, self._matched.scenarios)
+        names = tuple(self.recovery.arms[p] for p in self.matched)
+        draws = self.draws.part(np.array(self._matched.scenarios, int))
+        return self.initial_rates[index], self.recovery.rates[index], names, draws
 
     @cached_property
     def costs(self) -> list[InterventionCost]:
@@ -97,8 +304,8 @@ class Results:
 
     @property
     def unit(self) -> str:
-        """What the bootstrap resamples, in words."""
-        return "trajectory clusters" if self.study.platform == "robotwin" else "scenarios"
+        """What is taken as independent, in words."""
+        return WORDS[self.recovery.unit(self.options.cluster)]
 
 
 def analyse(study: Study, options: Options | None = None) -> Results:
@@ -117,7 +324,7 @@ def analyse(study: Study, options: Options | None = None) -> Results:
             raise RowsError(f"no policy {name!r} in the logs; there are {', '.join(study.policies)}")
     recovery = study.of(Start.RECOVERY)
     acting = [arm for arm in recovery if _intervenes(arm, options) and arm.policy != options.baseline]
-    direct = [arm for arm in recovery if arm not in acting]
+    direct = _best_first([arm for arm in recovery if arm not in acting], options)
     if not direct:
         what = (
             ", ".join(sorted({arm.start.value for arm in study.arms if arm not in acting}))
@@ -130,20 +337,50 @@ def analyse(study: Study, options: Options | None = None) -> Results:
     remarks = list(study.remarks)
     chosen, pairs = _pair(direct, [*acting, *study.of(Start.REVERSION)], options, remarks)
     initial = [
-        Arm(arm.policy, Start.RECOVERY, 0, arm.rows)  # titled by the policy alone
+        replace(arm, start=Start.RECOVERY, rewind_steps=(0,))  # titled by the policy alone
         for arm in study.of(Start.INITIAL)
         if arm.policy in {d.policy for d in direct}
     ]
     remarks += _initial_remarks(direct, initial)
+    panel = make_panel(direct, options.scheduled)
+    if words := _compared(panel, direct, options).words:
+        remarks.append(words)
+    if options.common and not (panel.trials > 0).all(0).any():
+        raise RowsError("--common: no scenario was run by all policies")
     return Results(
         study,
         options,
-        make_panel(direct, options.scheduled),
+        panel,
         make_panel(initial) if initial else None,
         make_panel(chosen, options.scheduled) if pairs else None,
         tuple(pairs),
         tuple(remarks),
     )
+
+
+def _best_first(direct: Sequence[Arm], options: Options) -> list[Arm]:
+    """Policies as every table and figure shows them: highest RSR first, those that are not ranked last."""
+    if len(direct) < 2:
+        return list(direct)
+    panel = make_panel(direct, options.scheduled)
+    chosen = _compared(panel, direct, options)
+    whole = panel.rates[:, list(chosen.scenarios)] if chosen.scenarios else panel.rates
+    ranked = {p: float(whole[p].mean()) for p in chosen.policies}
+    others = masked_mean(panel.rates.T)
+
+    def place(p: int) -> tuple[bool, float, str]:
+        return p not in ranked, -ranked.get(p, others[p]), panel.arms[p]
+
+    return [direct[p] for p in sorted(range(len(direct)), key=place)]
+
+
+def _compared(panel: Panel, direct: Sequence[Arm], options: Options) -> Compared:
+    """Which policies are ranked; none whose run stopped early beside one that did not."""
+    run = panel.trials > 0
+    early = np.array([arm.unreached for arm in direct])
+    if early.any() and not early.all():
+        run = run & ~early[:, None]
+    return compared(run, panel.arms, common=options.common and not early.any())
 
 
 def _initial_remarks(direct: Sequence[Arm], initial: Sequence[Arm]) -> list[str]:

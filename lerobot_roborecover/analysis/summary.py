@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from lerobot_roborecover.analysis.estimators import (
     RowsError,
     ScenarioRates,
-    bootstrap_interval,
     invalid_counts,
-    macro,
-    rsr,
     scenario_rates,
 )
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, rate_interval, spread
 from lerobot_roborecover.scenario import DeviationType, Stage, Start
 
 UNDERPOWERED_BELOW = 10
@@ -28,15 +28,6 @@ _TITLES = {
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A rate with its 95 % interval, all in [0, 1]; NaN where nothing can be said."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class CellSummary:
     """One cell, stage × deviation type, from recovery starts."""
 
@@ -47,7 +38,7 @@ class CellSummary:
 
     @property
     def underpowered(self) -> bool:
-        """Too few scenarios for the interval to mean much: a bootstrap cannot show what it never drew."""
+        """Too few scenarios for the rate to mean much."""
         return self.scenarios < UNDERPOWERED_BELOW
 
 
@@ -103,22 +94,34 @@ def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None
         start=start,
         scenarios=len(scenarios),
         trials=int(scenarios.trials.sum()),
-        rsr=_estimate(scenarios),
-        macro=Estimate(
-            macro(scenarios.rates, scenarios.cells),
-            *bootstrap_interval(scenarios.rates, scenarios.cells, clusters=scenarios.clusters),
-        ),
+        rsr=rate_estimate(scenarios.rates, scenarios.units),
+        macro=rate_estimate(scenarios.rates, scenarios.units, scenarios.cells),
         invalid=invalid_counts(rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
     )
 
 
 def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
-    return CellSummary(cell, len(scenarios), int(scenarios.trials.sum()), _estimate(scenarios))
+    estimate = rate_estimate(scenarios.rates, scenarios.units)
+    return CellSummary(cell, len(scenarios), int(scenarios.trials.sum()), estimate)
 
 
-def _estimate(scenarios: ScenarioRates) -> Estimate:
-    return Estimate(rsr(scenarios.rates), *bootstrap_interval(scenarios.rates, clusters=scenarios.clusters))
+def rate_estimate(
+    rates: np.ndarray,
+    units: Sequence[str],
+    cells: Sequence[str] | None = None,
+    level: float = LEVEL,
+) -> Estimate:
+    """RSR, or Macro where cells are given, with the interval that every table and page shows.
+
+    Args:
+        rates: (n,) in [0, 1].
+        units: n labels of what is independent.
+        cells: n labels.
+        level: confidence level.
+    """
+    found = spread(rates, units, cells=cells)
+    return Estimate(found.value, *rate_interval(found, level))
 
 
 def _cell_order(cell: str) -> tuple[int, int]:

@@ -9,7 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW, Estimate
+from lerobot_roborecover.analysis.escape import csv_text, latex, markdown
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 
 Kind = Literal["text", "percent", "points", "ratio", "count", "number", "p"]
 Cell = str | int | float | Estimate | None
@@ -106,15 +108,12 @@ def to_markdown(table: Table) -> str:
     """GitHub-flavoured Markdown: heading, table, notes."""
     head = [column.title for column in table.columns]
     rule = ["---" if column.kind == "text" else "---:" for column in table.columns]
-    lines = [f"## {table.title}", ""]
-    lines += [f"| {' | '.join(_pipe(c) for c in cells)} |" for cells in (head, rule, *table.texts())]
-    lines += [f"\n{_pipe(note)}" for note in table.all_notes()]
+    lines = [f"## {markdown(table.title, cell=True)}", ""]
+    lines += [
+        f"| {' | '.join(markdown(c, cell=True) for c in cells)} |" for cells in (head, rule, *table.texts())
+    ]
+    lines += [f"\n{markdown(note)}" for note in table.all_notes()]
     return "\n".join(lines) + "\n"
-
-
-def _pipe(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
-    return escaped.replace("<", "&lt;").replace(SPARSE_MARK, " \\*")
 
 
 def to_csv(table: Table) -> str:
@@ -125,6 +124,7 @@ def to_csv(table: Table) -> str:
     head: list[str] = []
     for column, wide in zip(table.columns, split, strict=True):
         head += [column.title, f"{column.title} low", f"{column.title} high"] if wide else [column.title]
+    head = [csv_text(title) for title in head]
     writer.writerow([*head, "few scenarios"] if table.sparse else head)
     for index, row in enumerate(table.rows):
         fields: list[str] = []
@@ -138,7 +138,7 @@ def _csv_fields(value: Cell, wide: bool) -> list[str]:
     if isinstance(value, Estimate):
         return [_csv_number(v) for v in (value.value, value.low, value.high)]
     is_text = value is None or isinstance(value, str)
-    text = _csv_text(value or "") if is_text else _csv_number(value)
+    text = csv_text(value or "") if is_text else _csv_number(value)
     return [text, "", ""] if wide else [text]
 
 
@@ -146,33 +146,11 @@ def _csv_number(value: float) -> str:
     return NOT_DEFINED if math.isnan(value) else f"{value:.10g}"
 
 
-def _csv_text(text: str) -> str:
-    """Names come from logs: none may start what a spreadsheet would run as a formula."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t")) else text
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"$<$",
-    "×": r"$\times$",
-    "−": "--",
-}
-
-
 def to_latex(table: Table) -> str:
     """A `table` environment with booktabs rules."""
     shape = "".join("l" if column.kind == "text" else "r" for column in table.columns)
-    rows = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in table.texts()]
-    head = " & ".join(_latex(column.title) for column in table.columns) + r" \\"
+    rows = [" & ".join(latex(cell) for cell in row) + r" \\" for row in table.texts()]
+    head = " & ".join(latex(column.title) for column in table.columns) + r" \\"
     caption = " ".join([f"{table.title}.", *table.all_notes()])
     lines = [
         r"\begin{table}[t]",
@@ -185,15 +163,11 @@ def to_latex(table: Table) -> str:
         *rows,
         r"\bottomrule",
         r"\end{tabular}",
-        rf"\caption{{{_latex(caption)}}}",
+        rf"\caption{{{latex(caption)}}}",
         rf"\label{{tab:roborecover-{table.name.replace('_', '-')}}}",
         r"\end{table}",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def to_text(table: Table) -> str:

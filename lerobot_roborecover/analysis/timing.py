@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.summary import Estimate
 
 FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 """Budgets shown in the table, as shares of each scenario's horizon."""
@@ -45,7 +45,7 @@ def budget_estimates(
 ) -> list[list[Estimate]]:
     """RSR of every policy at every budget, with intervals: P lists of B estimates."""
     rates = rates_within(panel, budgets, of_horizon=of_horizon)
-    return [resampling.estimates(rates[p]) for p in range(len(rates))]
+    return [resampling.rates(rates[p]) for p in range(len(rates))]
 
 
 def median_steps(panel: Panel) -> list[float]:

@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serves the page until interrupted, or has programs annotate."""
-    from lerobot_roborecover.build.annotate.serve import AnnotateConfig, serve
-    from lerobot_roborecover.build.auto_annotate.annotators import EYES, PREFIX, is_automatic
-    from lerobot_roborecover.build.auto_annotate.run import annotate
+    from lerobot_roborecover.curation.annotation.annotators import EYES, PREFIX, is_automatic
     from lerobot_roborecover.scenario import ScenarioError
+    from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
+    from lerobot_roborecover.studio.automatic.run import annotate
 
     reserved = [name for name in args.annotators if is_automatic(name)]
     if reserved:

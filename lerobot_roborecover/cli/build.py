@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-HELP = "Build a scenario dataset from one YAML file: collect, annotate, agree, screen, validate, split."
+HELP = (
+    "Build a scenario dataset from one YAML file: collect, annotate, agree, screen, validate, split, render."
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,23 +18,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--from", dest="first", default="", metavar="STAGE",
         help="run this stage and all after it, changed or not: collect, join, annotate, agree, screen, "
-        "validate, split, publish",
+        "validate, split, render, publish",
     )  # fmt: skip
     add("--until", default="", metavar="STAGE", help="stop after this stage")
     add("--dry-run", action="store_true", help="say what would run, and run nothing")
 
 
+def parse(argv: list[str]) -> argparse.Namespace:
+    """Takes a stage's command apart and checks its options, as the command itself does first."""
+    from lerobot_roborecover.cli import collect
+    from lerobot_roborecover.cli.main import build_parser
+
+    if argv[0] != "collect":
+        return build_parser().parse_args(argv)
+    parser = collect.build_parser()
+    args, rest = parser.parse_known_args(collect.pairs(argv[1:]))
+    collect.options(parser, args, rest).check()
+    return args
+
+
 def run(args: argparse.Namespace) -> int:
     """Builds, writes the summary, and prints the funnel."""
-    import shlex
-
-    from lerobot_roborecover.build.chain.commands import publish_command
-    from lerobot_roborecover.build.chain.config import read_config
-    from lerobot_roborecover.build.chain.stages import Chain, Waiting
-    from lerobot_roborecover.build.chain.summary import write_summary
     from lerobot_roborecover.cli.main import main
+    from lerobot_roborecover.curation.pipeline.check import check_build
+    from lerobot_roborecover.curation.pipeline.commands import publish_command
+    from lerobot_roborecover.curation.pipeline.config import read_config
+    from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting
+    from lerobot_roborecover.curation.pipeline.summary import write_summary
+    from lerobot_roborecover.words import next_line
 
     config = read_config(args.config)
+    if problems := check_build(config, parse):
+        listed = "\n".join(f"  - {problem}" for problem in problems)
+        print(f"{args.config} cannot be built, and nothing was run:\n{listed}", file=sys.stderr)
+        if not args.dry_run:
+            return 2
     chain = Chain(config, lambda argv: main(argv), lambda line: print(line, flush=True))
     waiting = ""
     try:
@@ -39,12 +60,12 @@ def run(args: argparse.Namespace) -> int:
     except Waiting as err:
         waiting, done = str(err), []
     if args.dry_run:
-        return 0
+        return 2 if problems else 0
     if text := write_summary(chain.places, args.config, done):
         print(f"\n{text}\n\nsummary in {chain.places.summary}")
     if waiting:
         print(f"\nstopped: {waiting}")
         return 1
     if config.publish is None and not args.until:
-        print(f"\nto publish: roborecover {shlex.join(publish_command(config, chain.places))}")
+        print("\n" + next_line(publish_command(config, chain.places), "to publish"))
     return 0

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.collect.options import CollectOptions
+
+from lerobot_roborecover.datasets.licenses import license_argument
 
 HELP = "Roll out a policy or a scripted driver from initial states, and keep its failures as candidates."
 
@@ -21,9 +26,9 @@ def build_parser() -> argparse.ArgumentParser:
         "any --env.OPTION=VALUE are those of roborecover eval. A rerun goes on where it was stopped.",
     )
     add = parser.add_argument
-    add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy")
+    add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy; ? lists them")
     add("--name", default="", help="recorded name of whoever drives (checkpoint, or expert)")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder of the candidate dataset")
+    add("--out", type=Path, metavar="DIR", help="folder of the candidate dataset; needed to collect")
     add("--work", type=Path, metavar="DIR", help="folder of the rollouts, kept (OUT.work)")
     add(
         "--task", action="append", default=[], metavar="PATTERN",
@@ -67,31 +72,47 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--retry-errors", action="store_true", help="roll out again what broke in an earlier run")
     add("--description", default="", help="of the dataset")
-    add("--license", help="SPDX identifier of the dataset; none is assumed")
+    add(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the dataset; none is assumed",
+    )
     add("--dry-run", action="store_true", help="list the rollouts, and run none")
     return parser
 
 
 def pass_through(argv: Sequence[str]) -> int:
     """Parses, collects, and prints the table."""
-    _quiet()
-    from lerobot_roborecover.build.collect.collection import collect, describe, plan
+    from lerobot_roborecover.curation.collect.collection import collect, describe, plan
+    from lerobot_roborecover.words import counted, next_line
 
     parser = build_parser()
-    args, rest = parser.parse_known_args(_pairs(argv))
-    options = _options(parser, args, rest)
+    args, rest = parser.parse_known_args(pairs(argv))
+    if args.expert == "?":
+        from lerobot_roborecover.curation.collect.experts import list_experts
+
+        kinds = [
+            w.partition("=")[2].removeprefix("roborecover_") for w in rest if w.startswith("--env.type=")
+        ]
+        print(list_experts(kinds[-1] if kinds else ""))
+        return 0
+    if args.out is None:
+        parser.error("the following arguments are required: --out")
+    chosen = options(parser, args, rest)
     if args.dry_run:
-        units = plan(options, lambda line: print(line, file=sys.stderr))
+        units = plan(chosen, lambda line: print(line, file=sys.stderr))
         for unit in units:
             print(f"{unit.id}  {unit.task.suite}/{unit.task.name}")
-        print(f"{len(units)} rollouts; dry run: nothing was run")
+        print(f"{counted(len(units), 'rollout')}; dry run: nothing was run")
         return 0
-    collected = collect(options, lambda line: print(line, file=sys.stderr))
+    collected = collect(chosen, lambda line: print(line, file=sys.stderr))
     print(describe(collected))
+    if collected.out is not None:
+        print(next_line(["annotate", str(collected.out), "--annotator", "NAME"]))
     return 0 if collected.out is not None else 1
 
 
-def _pairs(argv: Sequence[str]) -> list[str]:
+def pairs(argv: Sequence[str]) -> list[str]:
     """`--policy.path X` and `--env.type X` as `--policy.path=X`."""
     joined: list[str] = []
     for word in argv:
@@ -103,11 +124,15 @@ def _pairs(argv: Sequence[str]) -> list[str]:
     return joined
 
 
-def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]):
-    from lerobot_roborecover.build.collect.judge import Judging
-    from lerobot_roborecover.build.collect.options import CollectOptions
-    from lerobot_roborecover.build.collect.starts import Starts, parse_numbers
+def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]) -> CollectOptions:
+    """What to collect, from parsed arguments and those that are LeRobot's."""
+    from lerobot_roborecover.curation.collect.judge import Judging
+    from lerobot_roborecover.curation.collect.options import CollectOptions
+    from lerobot_roborecover.curation.collect.starts import parse_numbers
     from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.platforms import platform_names
+    from lerobot_roborecover.platforms.base import ENV_PREFIX
+    from lerobot_roborecover.platforms.starts import Starts
 
     policy, kind, env, policy_options = "", "", [], []
     for word in rest:
@@ -122,11 +147,9 @@ def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: li
             env.append(word.removeprefix("--env."))
         else:
             parser.error(f"unrecognized argument: {word}")
-    if kind not in ("libero", "metaworld", "robotwin", "fake"):
-        raise OptionError(
-            f"--env.type={kind or 'none'}: give roborecover_libero, roborecover_metaworld or "
-            "roborecover_robotwin"
-        )
+    if kind not in platform_names():
+        known = ", ".join(f"{ENV_PREFIX}{name}" for name in platform_names())
+        raise OptionError(f"--env.type={kind or 'none'}: give one of {known}")
     if args.frames != "none" and not args.frames.isdigit():
         raise OptionError(f"--frames={args.frames}: none, or a side in pixels")
     if not isinstance(args.rename_map, dict):
@@ -161,12 +184,3 @@ def _options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: li
         description=args.description,
         license=args.license,
     )
-
-
-def _quiet() -> None:
-    """Bars and encoder messages of every episode would bury the progress line."""
-    os.environ.setdefault("TQDM_DISABLE", "1")
-    os.environ.setdefault("SVT_LOG", "1")
-    import datasets
-
-    datasets.disable_progress_bars()

@@ -13,9 +13,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument(
         "--platform",
-        choices=("libero", "metaworld", "robotwin", "all"),
+        metavar="NAME",
         default="all",
-        help="what has to work; with all (the default), a platform that is not installed is only a warning",
+        help="what has to work, e.g. libero; with all (the default), a platform that is not "
+        "installed is only a warning",
     )
     parser.add_argument("--json", action="store_true", help="print the checks as one JSON object")
 

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.datasets.licenses import license_argument
+
 HELP = (
     "Make the dataset that Correction is trained on: other policies' recoveries of training scenarios that "
     "the base policy does badly on."
@@ -44,7 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="normalise as this checkpoint does, whose training goes on here (default: the base, where "
         "--base is a checkpoint's folder)",
     )  # fmt: skip
-    add("--license", help="SPDX identifier of the trajectories; none is assumed")
+    add(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the trajectories; none is assumed",
+    )
     add(
         "--env", action="append", default=[], metavar="NAME=VALUE",
         help="option of the recovery env type, e.g. obs_type=state; may be given again",
@@ -55,12 +61,13 @@ def run(args: argparse.Namespace) -> int:
     """Chooses, runs, judges, writes; prints the funnel."""
     import json
 
-    from lerobot_roborecover.build import donors
-    from lerobot_roborecover.build.normalisation import use_statistics_of
-    from lerobot_roborecover.build.policy_trials import env_config, read_trials, run_trials
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation import donors
+    from lerobot_roborecover.curation.normalisation import use_statistics_of
+    from lerobot_roborecover.curation.policy_trials import env_config, read_trials, run_trials
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.datasets.schema import FOLDER
-    from lerobot_roborecover.env.command_line import policy_identity
+    from lerobot_roborecover.env.identity import policy_identity
     from lerobot_roborecover.env.trial_log import read_trial_log
     from lerobot_roborecover.scenario import ScenarioError
 
@@ -76,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     candidates = donors.choose_candidates(scenarios, rows, base, options, funnel)
     trials = [t for folder in args.trials_from for t in read_trials(folder)]
     work = args.work or args.out.with_name(f"{args.out.name}.trials")
+    progress = Progress("trial")
     for number, checkpoint in enumerate(args.donor):
         name = policy_identity(checkpoint)
         ids = [c.scenario.id for c in candidates if c.policy == name]
@@ -88,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         trials += run_trials(
             checkpoint, env, work / f"{number}-{name.replace('/', '--')}", trials=args.trials,
             seed=args.run_seed, device=args.device,
-            on_row=lambda row, done, total: _progress(f"trials of {row.policy}", done, total),
+            on_row=lambda row, done, total: progress.of(f"trials of {row.policy}", done, total),
         )  # fmt: skip
     passed = donors.judge(candidates, trials, options, funnel)
     chosen = donors.deduplicate(passed, options, funnel)
@@ -96,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     donors.write_donors(
         args.out, chosen, simulator=spec.slot.options, workers=args.workers, funnel=funnel,
         description=f"Recoveries by other policies where {base} fails, for Correction.", license=args.license,
-        on_trajectory=lambda done, total: _progress("replayed", done, total),
+        on_trajectory=Progress("replay"),
     )  # fmt: skip
     note = donors.describe(options, base, funnel)
     if args.statistics_of or Path(args.base).is_dir():
@@ -108,8 +116,3 @@ def run(args: argparse.Namespace) -> int:
         f"--dataset.root={args.out} --output_dir=correction"
     )
     return 0
-
-
-def _progress(what: str, done: int, total: int) -> None:
-    if done == total or done % 10 == 0:
-        print(f"\r{what}: {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True)

@@ -35,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="measure also on scenarios that the monitor was trained on: says nothing about others",
     )  # fmt: skip
     add("--num-workers", type=int, default=0, help="processes that read frames (%(default)s)")
-    add("--draws", type=int, default=10_000, help="bootstrap draws (%(default)s)")
-    add("--seed", type=int, default=0, help="seed of the draws (%(default)s)")
+    add("--draws", type=int, default=10_000, help="without effect: the intervals need no draws")
+    add("--seed", type=int, default=0, help="without effect, likewise")
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
 
 
@@ -46,8 +46,10 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.monitor_curves import choose_threshold
     from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, write_monitor_report
     from lerobot_roborecover.analysis.monitor_report import monitor_report
+    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation.monitor_data.judging import judge_dataset
     from lerobot_roborecover.interventions.monitor.errors import MonitorError
-    from lerobot_roborecover.interventions.monitor.judging import judge_dataset
     from lerobot_roborecover.interventions.monitor_loading import load_monitor
 
     if args.threshold is not None and args.choose_threshold:
@@ -58,15 +60,14 @@ def run(args: argparse.Namespace) -> int:
     monitor = load_monitor(args.monitor, args.device, args.revision, **overrides)
     judged = []
     for text in args.data:
-        name, _, rest = text.rpartition("=") if not Path(text).exists() else ("", "", text)
+        name, rest = split_named(text)
         frames, _ = judge_dataset(
             monitor,
             Path(rest),
             num_workers=args.num_workers,
             on_training_scenarios=args.on_training_scenarios,
-            on_batch=lambda done, total: print(f"\r{done} of {total} frames", end="", file=sys.stderr),
+            on_batch=Progress("frame"),
         )
-        print(file=sys.stderr)
         judged.append((name or Path(rest).name, frames))
     if len({name for name, _ in judged}) < len(judged):
         raise MonitorError(f"two datasets have one name: {[n for n, _ in judged]}; write --data NAME=DIR")
@@ -78,10 +79,7 @@ def run(args: argparse.Namespace) -> int:
             raise MonitorError(f"--choose-threshold={args.choose_threshold}: {err}") from None
     if threshold is not None:
         judged = [(name, frames.at(threshold)) for name, frames in judged]
-    measured = [
-        Measured(name, frames, monitor_report(frames, draws=args.draws, seed=args.seed, level=args.level))
-        for name, frames in judged
-    ]
+    measured = [Measured(name, frames, monitor_report(frames, level=args.level)) for name, frames in judged]
     trained = monitor.trained_on.get("scenarios", {})
     if not trained:
         print("note: the checkpoint does not say which scenarios it was trained on", file=sys.stderr)

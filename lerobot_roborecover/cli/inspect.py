@@ -29,15 +29,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=256,
         help="with --scenario: picture side in pixels (%(default)s); RoboTwin's own configuration says its",
     )
-    add("--render-quality", default="rt", help="of RoboTwin's pictures: rt, default, minimal or trivial")
+    add(
+        "--render-quality",
+        help="where the platform has several (RoboTwin: rt, default, ...)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the tables, or replays one scenario."""
     from lerobot_roborecover.datasets.inspect import describe, summary, write_scenario
     from lerobot_roborecover.datasets.load import load_scenarios
+    from lerobot_roborecover.platforms import make_simulator
     from lerobot_roborecover.scenario import ScenarioError
-    from lerobot_roborecover.simulators import make_simulator
 
     found = load_scenarios(args.dataset, revision=args.revision, split=args.split, select=args.select)
     if args.scenario is None:
@@ -62,8 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _options(args: argparse.Namespace, platform: str) -> dict[str, Any]:
     """Options of the simulator that say how the pictures are to look."""
-    if platform == "robotwin":
-        return {"render_quality": args.render_quality}
-    if platform == "fake":
-        return {"observation_size": args.size}
-    return {"observation_height": args.size, "observation_width": args.size}
+    from lerobot_roborecover.platforms import platform_named
+
+    quality = {} if args.render_quality is None else {"render_quality": args.render_quality}
+    return platform_named(platform).picture_options(args.size) | quality

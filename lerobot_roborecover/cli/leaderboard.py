@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lerobot_roborecover.cli.report import add_draws_arguments
+from lerobot_roborecover.cli.report import add_draws_arguments, analysis_options
 
 HELP = (
     "Make a leaderboard (a static page and JSON) from all trial logs below a folder; or push one "
@@ -22,6 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--title", default="Recovery leaderboard", help="heading of the page (%(default)s)")
     add_draws_arguments(parser)
     add(
+        "--method",
+        action="append",
+        default=[],
+        metavar="NAME=LOG,LOG",
+        help="logs below the folder (or folders of them) that are the runs of one method; may be given again",
+    )
+    add(
         "--push-to",
         metavar="ORG/MODEL",
         help="push results to this model on the Hub as evaluation-results metadata",
@@ -36,10 +43,9 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.hub_results import file_name, find_entry, push_results, results_yaml
     from lerobot_roborecover.analysis.leaderboard import make_leaderboard
     from lerobot_roborecover.analysis.leaderboard_page import board_table, write_leaderboard
-    from lerobot_roborecover.analysis.results import Options
     from lerobot_roborecover.analysis.tables import to_text
 
-    found = make_leaderboard(args.folder, Options(args.draws, args.seed, args.level, args.trials))
+    found = make_leaderboard(args.folder, analysis_options(args), args.method)
     page, data = write_leaderboard(found, args.out, args.title)
     for board in found.boards:
         table = board_table(board)

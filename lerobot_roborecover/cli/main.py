@@ -10,12 +10,15 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from lerobot_roborecover import __version__
+from lerobot_roborecover.errors import RoboRecoverError
 
 COMMANDS = (
     "doctor",
+    "check-platform",
     "demo",
     "study",
     "check-policy",
+    "plan",
     "eval",
     "merge",
     "report",
@@ -37,6 +40,7 @@ COMMANDS = (
     "screen",
     "validate",
     "split",
+    "render",
     "build",
 )
 """Each is a module of this folder (dashes as underscores) with `HELP`, `add_arguments(parser)` and
@@ -77,8 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 done but something is wrong, 2 refused, 130 interrupted.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
-    os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a film
     command = argv[0] if argv else ""
+    quiet(command)
     module = _module(command) if command in COMMANDS else None
     try:
         if module is not None and hasattr(module, "pass_through"):
@@ -88,22 +92,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"roborecover {command}: interrupted", file=sys.stderr)
         return 130
-    except _refusals() as err:
+    except RoboRecoverError as err:
         print(f"roborecover {command}: {err}", file=sys.stderr)
         return 2
 
 
-def _refusals() -> tuple[type[Exception], ...]:
-    """Errors whose message is all that a user needs; Python evaluates this only once something was raised."""
-    from lerobot_roborecover.analysis.estimators import RowsError
-    from lerobot_roborecover.demo import DemoError
-    from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.env.trial_log import TrialLogError
-    from lerobot_roborecover.remote.errors import RemoteError
-    from lerobot_roborecover.scenario import ScenarioError
-    from lerobot_roborecover.simulators import SimulatorError
+def quiet(command: str) -> None:
+    """Keeps libraries from burying a command's own lines in theirs, in this process and those it starts.
 
-    return (DemoError, OptionError, RowsError, RemoteError, ScenarioError, SimulatorError, TrialLogError)
+    Args:
+        command: `study` trains with LeRobot's own commands, whose bars are the only progress there is.
+    """
+    os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a film
+    if command != "study":
+        os.environ.setdefault("TQDM_DISABLE", "1")
 
 
 if __name__ == "__main__":

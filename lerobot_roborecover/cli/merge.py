@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 HELP = "join the trial logs of shards; refuses logs of different protocols"
@@ -19,9 +20,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merges and says what came together."""
-    from lerobot_roborecover.evaluate.merge import merge
+    from lerobot_roborecover.trials.merge import merge
+    from lerobot_roborecover.words import counted
 
-    rows = merge(args.logs, args.out, unequal=args.unequal)
-    scenarios = len({r.scenario_id for r in rows})
-    print(f"{len(rows)} trials of {scenarios} scenarios from {len(args.logs)} logs in {args.out}")
+    merged = merge(args.logs, args.out, unequal=args.unequal)
+    scenarios = len({r.scenario_id for r in merged.rows})
+    for remark in merged.remarks:
+        print(f"note: {remark}", file=sys.stderr)
+    found = f"{counted(len(merged.rows), 'trial')} of {counted(scenarios, 'scenario')}"
+    print(f"{found} from {counted(len(args.logs), 'log')} in {args.out}")
     return 0

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
+
+from lerobot_roborecover.datasets.licenses import license_argument
 
 HELP = (
     "Make the frames that a monitor is trained and measured on: screening policies continue each scenario "
@@ -42,7 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--run-seed", type=int, default=1000, help="of the policies' trials (%(default)s)")
     add("--device", help="of the policies")
     add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
-    add("--license", help="SPDX identifier of the frames; none is assumed")
+    add(
+        "--license",
+        type=license_argument,
+        help="licence by the Hub's identifier, of the frames; none is assumed",
+    )
     add(
         "--env", action="append", default=[], metavar="NAME=VALUE",
         help="option of the recovery env type, e.g. obs_type=state; may be given again",
@@ -57,8 +62,9 @@ def run(args: argparse.Namespace) -> int:
     """Makes the data and prints the counts."""
     import datasets
 
-    from lerobot_roborecover.build.monitor.choice import TRAIN, DataOptions
-    from lerobot_roborecover.build.monitor.request import MonitorRequest, make_monitor_data
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation.monitor_data.choice import TRAIN, DataOptions
+    from lerobot_roborecover.curation.monitor_data.request import MonitorRequest, make_monitor_data
 
     datasets.disable_progress_bars()  # LeRobot's writer shows one per episode
     choice = DataOptions(
@@ -88,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         workers=args.workers,
         license=args.license,
     )
-    made = make_monitor_data(request, _progress)
+    made = make_monitor_data(request, Progress("frame").of)
     print(f"{'':22}{'IDs':>7}{'traj.':>8}{'frames':>9}{'label 0':>9}{'label 1':>9}")
     for part, c in made.counts.items():
         numbers = (c["ids"], c["trajectories"], c["frames"], c["label0"], c["label1"])
@@ -99,8 +105,3 @@ def run(args: argparse.Namespace) -> int:
         config = "policies/train/monitor_small.yaml"
         print(f"\nlerobot-train --config_path={config} --dataset.root={args.out / TRAIN}")
     return 0
-
-
-def _progress(what: str, done: int, total: int) -> None:
-    if done == total or done % 10 == 0:
-        print(f"\r{what}: {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True)

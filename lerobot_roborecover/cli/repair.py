@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Repairs, and says what it did."""
-    from lerobot_roborecover.datasets.repair import repair
+    from lerobot_roborecover.curation.repair import repair_dataset
 
-    print("\n".join(repair(args.dataset, args.sources, dry_run=args.dry_run).lines))
+    print("\n".join(repair_dataset(args.dataset, args.sources, dry_run=args.dry_run).lines))
     return 0

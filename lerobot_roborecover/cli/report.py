@@ -20,10 +20,27 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "logs",
         nargs="+",
-        metavar="[NAME=]LOG",
-        help="trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name",
+        metavar="[NAME=]LOG[,LOG]",
+        help="trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name; several "
+        "after one NAME are runs of one method",
     )
     add("--platform", help="take this platform's rows only")
+    add(
+        "--common",
+        action="store_true",
+        help="rank all policies on the scenarios that all were run on (default: those that were run on all)",
+    )
+    add(
+        "--baseline",
+        help="policy that interventions are compared with, where it does not follow from the logs",
+    )
+    add(
+        "--intervention",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="treat this policy as an intervention although no trial of it shows one; may be given again",
+    )
     add_draws_arguments(parser)
 
 
@@ -38,6 +55,29 @@ def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
     add("--draws", type=int, default=10_000, help="bootstrap draws (%(default)s)")
     add("--seed", type=int, default=0, help="seed of the draws (%(default)s)")
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
+    add(
+        "--cluster",
+        choices=("scenario", "trajectory", "task"),
+        help="what intervals and tests take as independent; task: the numbers speak of other tasks like "
+        "these (default: as the paper, trajectory on RoboTwin, else scenario)",
+    )
+
+
+def analysis_options(args: argparse.Namespace):
+    """`Options` from the arguments above and those that a command has of the rest."""
+    from lerobot_roborecover.analysis.results import Options
+    from lerobot_roborecover.analysis.units import Unit
+
+    return Options(
+        args.draws,
+        args.seed,
+        args.level,
+        args.trials,
+        getattr(args, "baseline", None),
+        tuple(getattr(args, "intervention", ())),
+        Unit(args.cluster) if args.cluster else None,
+        getattr(args, "common", False),
+    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,17 +86,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--out", type=Path, default=Path("outputs/report"), help="folder of the report (%(default)s)")
     add("--title", default="Recovery report", help="heading of the report (%(default)s)")
-    add(
-        "--baseline",
-        help="policy that interventions are compared with, where it does not follow from the logs",
-    )
-    add(
-        "--intervention",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="treat this policy as an intervention although no trial of it shows one; may be given again",
-    )
     add(
         "--scenarios",
         help="the evaluated scenario set (shipped name, folder, Hub id): checks the logs against it",
@@ -79,57 +108,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the report and prints its headline."""
-    from lerobot_roborecover.analysis.logs import read_study
-    from lerobot_roborecover.analysis.report import Extras, write_report
-    from lerobot_roborecover.analysis.report_tables import overall
-    from lerobot_roborecover.analysis.results import Options, analyse
-    from lerobot_roborecover.analysis.tables import to_text
+    from lerobot_roborecover.analysis.make import Gallery, report
 
-    study = read_study(args.logs, args.platform)
-    results = analyse(
-        study,
-        Options(args.draws, args.seed, args.level, args.trials, args.baseline, tuple(args.intervention)),
+    made = report(
+        args.logs,
+        args.out,
+        platform=args.platform,
+        title=args.title,
+        options=analysis_options(args),
+        gallery=Gallery(args.scenarios, args.revision, args.render, args.videos, args.videos_mb),
+        command=shlex.join(["roborecover", *sys.argv[1:]]),
     )
-    frames, clips, remarks = _pictures(args, study, results.recovery)
-    extras = Extras(frames, clips, tuple(remarks), args.title, shlex.join(["roborecover", *sys.argv[1:]]))
-    files = write_report(results, args.out, extras)
-    print(to_text(overall(results)))
-    for remark in (*results.remarks, *remarks):
+    for remark in made.remarks:
         print(f"note: {remark}", file=sys.stderr)
-    print(
-        f"\nreport    {files.html}\nmarkdown  {files.markdown}\ntables    "
-        f"{args.out / 'tables'}\nnumbers   {files.results}"
-    )
+    print(made.text())
     return 0
-
-
-def _pictures(args: argparse.Namespace, study, panel) -> tuple[dict, dict, list[str]]:
-    from lerobot_roborecover.analysis.gallery import check_scenarios, find_clips
-
-    frames: dict[str, bytes] = {}
-    remarks: list[str] = []
-    ids = [s.id for s in panel.scenarios]
-    if args.scenarios:
-        from lerobot_roborecover.datasets import load_scenarios
-
-        chosen = load_scenarios(args.scenarios, revision=args.revision)
-        remarks += check_scenarios(study, tuple(chosen), args.scenarios)
-        wanted = [s for s in chosen if s.id in set(ids)]
-        frames = {
-            s.id: s.fingerprint.frames_png[-1] for s in wanted if s.fingerprint and s.fingerprint.frames_png
-        }
-        todo = [s for s in wanted if s.id not in frames]
-        if args.render and todo:
-            from lerobot_roborecover.demo.pictures import render_frames
-
-            print(f"rendering {len(todo)} recovery frames ...", file=sys.stderr)
-            files, problem = render_frames(todo, args.out / "frames")
-            frames |= {i: path.read_bytes() for i, path in files.items()}
-            if problem:
-                remarks.append(f"pictures are missing: {problem}")
-    folders = []
-    for text in args.videos:
-        name, _, rest = text.rpartition("=") if not Path(text).exists() else ("", "", text)
-        folders.append((name, Path(rest)))
-    clips, skipped = find_clips(folders, ids, args.videos_mb * 2**20)
-    return frames, clips, remarks + skipped

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 HELP = (
@@ -67,10 +66,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Screens, and prints the tables and the funnel."""
-    from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.screen.dataset import ScreenRequest, screen_dataset
-    from lerobot_roborecover.build.screen.runs import parse_policies
-    from lerobot_roborecover.build.screen.screening import ScreenRule, format_histogram, format_policies
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
+    from lerobot_roborecover.curation.screen.dataset import ScreenRequest, screen_dataset, validate_next
+    from lerobot_roborecover.curation.screen.runs import parse_policies
+    from lerobot_roborecover.curation.screen.screening import ScreenRule, format_histogram, format_policies
+    from lerobot_roborecover.words import counted, next_line
 
     policies, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
     rule = ScreenRule(args.trials, tuple(args.keep), args.max_invalid)
@@ -90,24 +91,19 @@ def run(args: argparse.Namespace) -> int:
         slots=args.slots,
         max_batch=args.max_batch,
     )
-    made = screen_dataset(request, _progress)
+    made = screen_dataset(request, Progress("trial").of)
     if args.shard:
         print(f"part {args.shard}: trials in {request.trials}; join with --trials-from {request.trials}")
         return 0
     low, high = rule.check(len(policies))
     kept = sum(s.decision.verdict == "kept" for s in made.found)
     print(
-        f"{kept} of {len(made.found)} scenarios in {args.out}: {low} to {high} successes of "
-        f"{len(policies) * rule.trials} ({len(policies)} policies x {rule.trials} trials)\n"
+        f"{kept} of {counted(len(made.found), 'scenario')} in {args.out}: {low} to {high} successes of "
+        f"{len(policies) * rule.trials} "
+        f"({counted(len(policies), 'policy')} x {counted(rule.trials, 'trial')})\n"
     )
     print(format_policies(made.found), end="\n\n")
     print(format_histogram(made.found, rule), end="\n\n")
-    print(format_funnel(funnel(read_decisions(args.out))))
-    print(f"\nroborecover validate {args.out} --trials-folder {request.trials} --out VALIDATED")
+    print(attrition_table(count_stages(read_decisions(args.out))))
+    print("\n" + next_line(validate_next(args.out, request.trials)))
     return 0
-
-
-def _progress(policy: str, done: int, total: int) -> None:
-    if done == total or done % 10 == 0:
-        text = f"\rtrials of {policy}: {done} of {total}"
-        print(text, end="\n" if done == total else "", file=sys.stderr, flush=True)

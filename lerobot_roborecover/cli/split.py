@@ -37,9 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Divides, or checks, and reports."""
-    from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.split import SplitConfig, parse_apart, parse_sizes
-    from lerobot_roborecover.build.split_dataset import check_splits, format_report, split_dataset
+    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
+    from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_sizes
+    from lerobot_roborecover.curation.split_dataset import check_splits, format_report, split_dataset
+    from lerobot_roborecover.words import next_line
 
     apart = parse_apart(args.apart)
     if args.check:
@@ -53,8 +54,10 @@ def run(args: argparse.Namespace) -> int:
     print(format_report(report))
     if args.dry_run:
         print("dry run: nothing was changed")
-    elif rows := funnel(read_decisions(args.out or args.dataset)):
-        print(format_funnel(rows))
+    elif rows := count_stages(read_decisions(args.out or args.dataset)):
+        print(attrition_table(rows))
+    if not args.dry_run:
+        print(next_line(["render", str(args.out or args.dataset), "--out", "RENDERED"]))
     return 0
 
 

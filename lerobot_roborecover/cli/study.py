@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 
@@ -27,13 +26,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--stage", action="append", default=[], metavar="NAME", help="with --make: this stage only; again")
     add("--print", action="store_true", help="print the commands and run nothing")
+    add(
+        "--stored", action="store_true",
+        help="run nothing: print the tables, and write the report below --out/stored, of the stored outcomes",
+    )  # fmt: skip
     add("--no-report", action="store_true", help="stop after the trials and the comparison")
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluates, compares, reports; exit status 1 where outcomes differ from the stored ones."""
     from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.study.commands import arms, report_command
+    from lerobot_roborecover.study.arms import arms, report_command
     from lerobot_roborecover.study.definition import read_definition, shipped_study
     from lerobot_roborecover.study.evaluate import (
         compare_with_stored,
@@ -63,8 +66,16 @@ def run(args: argparse.Namespace) -> int:
         todo = list(
             arms(study, args.out, scenario_ids(study, args.every) if args.every > 1 else (), args.slots)
         )
-        for argv in [*(a.argv for a in todo), report_command(study, todo, args.out)]:
-            print(shlex.join(["roborecover", *argv]))
+        for line in [*(a.run.command_line() for a in todo), report_command(study, todo, args.out)]:
+            print(line)
+        return 0
+    if args.stored:
+        from lerobot_roborecover.study.stored import summary_table, write_stored_logs
+
+        done = write_stored_logs(study, args.out / "stored")
+        print(summary_table(done))
+        if not args.no_report:
+            print(f"report {write_report(study, done, args.out / 'stored').files.html}")
         return 0
     done = evaluate(
         study, args.out, args.every, args.slots, args.jobs, say=lambda line: print(line, flush=True)
@@ -72,8 +83,7 @@ def run(args: argparse.Namespace) -> int:
     write_outcomes(args.out / "outcomes.csv", outcomes_of(done))
     compared = compare_with_stored(study, done)
     if not args.no_report:
-        print(f"report {write_report(study, done, args.out)}")
-        print((args.out / "report.log").read_text(errors="replace"))
+        print(write_report(study, done, args.out).text())
     if compared is None:
         print("no stored outcomes to compare with", file=sys.stderr)
         return 0

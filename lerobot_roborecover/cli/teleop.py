@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add = parser.add_argument
     add("dataset", type=Path, help="the candidate dataset: a new folder, or one that this command made")
-    add("--platform", default="metaworld", help="metaworld or libero (%(default)s)")
+    add("--platform", default="metaworld", help="which can be driven by hand, e.g. libero (%(default)s)")
     add("--operator", metavar="NAME", help="who drives, or a pseudonym; goes into the dataset as the driver")
     add("--task", dest="tasks", action="append", default=[], metavar="NAME", help="repeat it for several")
     add("--suite", default="", help="where several suites have a task of that name")
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--port", type=int, default=8732, help="on this machine alone; 0 takes a free one (%(default)s)")
     add("--rate", type=float, metavar="HZ", help="control steps a second, at most (the simulator's own rate)")
     add("--fps", type=float, default=15.0, help="live pictures a second, at most (%(default)s)")
-    add("--view", type=int, default=256, metavar="PIXELS", help="size of the live pictures (%(default)s)")
+    add("--view", type=int, default=320, metavar="PIXELS", help="size of the live pictures (%(default)s)")
     add("--size", type=int, metavar="PIXELS", help="size of the dataset's pictures (the platform's own)")
     add(
         "--spacemouse", type=float, nargs="?", const=0.5, metavar="SPEED",
@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serves the page until interrupted, then writes the dataset."""
-    from lerobot_roborecover.build.teleop.serve import TeleopConfig, serve, write
-    from lerobot_roborecover.build.teleop.starts import continued, first_states
     from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.studio.teleop.serve import TeleopConfig, serve, write
+    from lerobot_roborecover.studio.teleop.starts import continued, first_states
 
     def say(line: str) -> None:
         print(line, flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 HELP = (
@@ -16,7 +15,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add = parser.add_argument
     add("dataset", type=Path, help="folder of a screened scenario dataset")
-    add("--trials-folder", required=True, type=Path, metavar="DIR", help="where screen kept the trials")
+    add("--trials-folder", type=Path, metavar="DIR", help="where screen kept the trials")
+    add(
+        "--states", action="store_true",
+        help="only replay the prefixes of a set that was made elsewhere or by an earlier version, and write "
+        "the hashes of their states: no scenario is judged, and nothing else changes",
+    )  # fmt: skip
     add(
         "--candidates", action="append", default=[], type=Path, metavar="DIR",
         help="candidate dataset that the scenarios were made from: original poses and frames; may be given "
@@ -48,11 +52,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Validates, and prints the distribution and the funnel."""
-    from lerobot_roborecover.build.funnel import format_funnel, funnel, read_decisions
-    from lerobot_roborecover.build.validate.dataset import validate_dataset
-    from lerobot_roborecover.build.validate.request import ValidationRequest
-    from lerobot_roborecover.build.validate.validation import ValidationRule, format_validation
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
+    from lerobot_roborecover.curation.validate.dataset import validate_dataset
+    from lerobot_roborecover.curation.validate.request import ValidationRequest
+    from lerobot_roborecover.curation.validate.validation import ValidationRule, format_validation
+    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.words import next_line
 
+    if args.states:
+        return _states(args)
+    if args.trials_folder is None:
+        raise OptionError("--trials-folder is missing: name the folder where roborecover screen kept trials")
     rule = ValidationRule(
         args.runs, args.seed, args.tolerance_mm, args.min_ssim, not args.no_frames, not args.no_outcomes
     )
@@ -71,10 +82,23 @@ def run(args: argparse.Namespace) -> int:
         limit_s=args.limit_s,
         work=args.work,
     )
-    made = validate_dataset(request, _progress)
+    made = validate_dataset(request, Progress("replay"))
     print(format_validation(made.replays, made.decisions, rule), end="\n\n")
-    print(format_funnel(funnel(read_decisions(args.out))))
+    print(attrition_table(count_stages(read_decisions(args.out))))
     print(f"\n{args.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out")
+    print(next_line(["split", str(args.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]))
+    return 0
+
+
+def _states(args: argparse.Namespace) -> int:
+    from lerobot_roborecover.cli.progress import Progress
+    from lerobot_roborecover.curation.validate.states import write_states
+
+    found = write_states(args.dataset, args.out, args.workers, Progress("replay"))
+    print(
+        f"{found.scenarios} states, each replayed twice and identical; {found.filled} had no hash; largest "
+        f"distance from the recording {found.largest_mm:g} mm\n{args.out}"
+    )
     return 0
 
 
@@ -95,7 +119,3 @@ def _read_rejects(path: Path | None) -> dict[str, str]:
                 raise ScenarioError(f"{path}, line {number}: {one:.140} has no reason; write: ID REASON")
             found[one] = reason.strip()
     return found
-
-
-def _progress(done: int, total: int) -> None:
-    print(f"\rreplayed {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True)

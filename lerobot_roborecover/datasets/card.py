@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.resources
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, FrameStore
+from lerobot_roborecover.datasets.licenses import license_metadata
 from lerobot_roborecover.datasets.pictures import grid_png, spread, stored_frame
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, SCENARIOS_FILE, package_versions
@@ -24,15 +24,6 @@ GENERATED = "<!-- roborecover:card -->"
 GRID = "assets/recovery_frames.png"
 GRID_TILES = 12
 """Most pictures of the grid."""
-_HUB_LICENSES = frozenset({
-    "apache-2.0", "mit", "bsd", "bsd-2-clause", "bsd-3-clause", "cc", "cc0-1.0", "cc-by-2.0", "cc-by-3.0",
-    "cc-by-4.0", "cc-by-sa-3.0", "cc-by-sa-4.0", "cc-by-nc-2.0", "cc-by-nc-3.0", "cc-by-nc-4.0",
-    "cc-by-nd-4.0", "cc-by-nc-nd-3.0", "cc-by-nc-nd-4.0", "cc-by-nc-sa-2.0", "cc-by-nc-sa-3.0",
-    "cc-by-nc-sa-4.0", "cdla-sharing-1.0", "cdla-permissive-1.0", "cdla-permissive-2.0", "gpl-3.0",
-    "gpl-2.0", "lgpl-3.0", "agpl-3.0", "mpl-2.0", "odc-by", "odbl", "openrail", "pddl", "unlicense",
-    "unknown", "other",
-})  # fmt: skip
-"""What the Hub's metadata takes as a licence (https://huggingface.co/docs/hub/repositories-licenses)."""
 
 
 @dataclass(frozen=True)
@@ -159,24 +150,6 @@ def _metadata(
         "size_categories": [_size_category(count)],
         "configs": configs,
     }
-
-
-def license_metadata(license: str | None) -> dict[str, str]:
-    """The Hub's licence fields of an SPDX identifier.
-
-    Raises:
-        ScenarioError: none is given; a licence is the publisher's decision and never assumed.
-    """
-    if not license:
-        raise ScenarioError(
-            "no licence: the dataset's manifest names none. Give the one under which you publish, e.g. "
-            "--license cc-by-4.0, or --license unknown"
-        )
-    if not isinstance(license, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.+ ()-]{0,80}", license):
-        raise ScenarioError(f"licence {license!r:.100} is not an SPDX identifier, e.g. CC-BY-4.0")
-    if license.lower() in _HUB_LICENSES:
-        return {"license": license.lower()}
-    return {"license": "other", "license_name": license.lower().replace(" ", "-")}
 
 
 def render_card(template: str, *, metadata: Mapping[str, Any], **values: Any) -> str:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
+from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.simulators import SimulatorError
 
 
 def write_converted(

@@ -19,8 +19,10 @@ import numpy as np
 
 from lerobot_roborecover.datasets.frames import LastFrames, Tail
 from lerobot_roborecover.datasets.write import write_scenarios
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.simulator import Observation, Simulator
+from lerobot_roborecover.platforms.walk import walk
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.simulators.base import Observation, Simulator
 
 EXACT_ACTION = "roborecover.action"
 """(A,) float64: the recorded action. LeRobot's own `action` column is its float32 rounding."""
@@ -42,14 +44,15 @@ def render_prefix(
         last: takes the last frames up to the recovery point, losslessly, once the last frame is drawn.
     """
     tail = Tail(scenario.platform)
-    simulator.reset(scenario.task, scenario.reset)
-    for action in scenario.prefix:
+    steps = len(scenario.prefix)
+    for step in walk(simulator, scenario.rollout):
+        if step == steps and last is None:
+            return
         observation = simulator.observe()
         tail.add(observation)
-        yield to_frame(scenario.platform, observation)
-        simulator.step(action)
+        if step < steps:
+            yield to_frame(scenario.platform, observation)
     if last is not None:
-        tail.add(simulator.observe())
         last.append(tail.frames(scenario))
 
 
@@ -58,10 +61,7 @@ def to_frame(platform: str, observation: Observation) -> dict[str, np.ndarray]:
     from lerobot.envs.utils import preprocess_observation
 
     seen = preprocess_observation(_batched(observation))
-    if platform == "libero":
-        from lerobot.processor.env_processor import LiberoProcessorStep
-
-        seen = LiberoProcessorStep().observation(seen)
+    seen = platform_named(platform).process_observation(seen)
     frame = {}
     for key, value in seen.items():
         array = value[0].numpy()
@@ -129,50 +129,17 @@ def write_lerobot_dataset(
         first_index: row of the first scenario in `scenarios.parquet`, where these are a part of a set.
 
     Raises:
-        ScenarioError: numbers of scenarios, actions and frames disagree.
+        ScenarioError: numbers of scenarios, actions, frames and video frames disagree.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot_roborecover.datasets.encoding import Episode, EpisodeWriter
 
-    dataset: Any = None
-    try:
+    with EpisodeWriter(root, fps, scenarios[0].platform) as writer:
         for index, (scenario, frames) in enumerate(_pair(scenarios, episodes), first_index):
-            written = 0
-            for frame in frames:
-                if written == len(scenario.prefix):
-                    written += 1
-                    break
-                if dataset is None:
-                    dataset = LeRobotDataset.create(
-                        repo_id=f"roborecover/{root.name.strip('.')}",
-                        fps=fps,
-                        features=features_of(frame, scenario.prefix.shape[1]),
-                        root=root,
-                        robot_type=scenario.platform,
-                        streaming_encoding=True,
-                    )
-                action = scenario.prefix[written]
-                dataset.add_frame(
-                    {
-                        **frame,
-                        "action": action.astype(np.float32),
-                        EXACT_ACTION: action,
-                        SCENARIO_INDEX: np.array([index], dtype=np.int64),
-                        "task": scenario.task.instruction,
-                    }
+            writer.write(
+                Episode(
+                    f"scenario {scenario.id}", scenario.prefix, frames, index, scenario.task.instruction, {}
                 )
-                written += 1
-            if written != len(scenario.prefix) or not written:
-                raise ScenarioError(
-                    f"scenario {scenario.id}: {len(scenario.prefix)} prefix actions, but "
-                    f"{written if written <= len(scenario.prefix) else 'more'} frames; an episode has one "
-                    "frame "
-                    "before each action, and at least one"
-                )
-            dataset.save_episode()
-    finally:
-        if dataset is not None:
-            # Without it the parquet files have no footer.
-            dataset.finalize()
+            )
 
 
 def _pair(

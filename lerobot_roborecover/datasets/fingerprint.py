@@ -8,29 +8,25 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.journal import AppendOnly, InUseError
+from lerobot_roborecover.platforms import SimulatorError, platform_named
+from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.platforms.versions import installed
 from lerobot_roborecover.replay import with_fingerprint
 from lerobot_roborecover.scenario import Fingerprint, Pose, Scenario, ScenarioError
-from lerobot_roborecover.simulators import SimulatorError, make_simulator
-from lerobot_roborecover.simulators.base import Simulator
-from lerobot_roborecover.versions import REQUIRED, installed
+from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
 type ResetCheck = Callable[[Simulator, Scenario], dict[str, float]]
 """Measures how far the simulator, just reset, is from what a scenario's record says; raises `ScenarioError`
 beyond what may be."""
 
 _SCENARIOS_PER_JOB = 8
-
-_simulator: Simulator | None = None
-"""The simulator of this worker process."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +48,7 @@ def fingerprint_scenarios(
     options: Mapping[str, Any] | None = None,
     check: ResetCheck | None = None,
     workers: int = 1,
+    pool: JobPool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Replayed]:
     """Replays every scenario once.
@@ -63,6 +60,7 @@ def fingerprint_scenarios(
         options: of the simulator, JSON values.
         check: a function of a module, run after each reset.
         workers: processes.
+        pool: processes that are there already, with their own options, in place of new ones.
         progress: called with the numbers done and in all.
 
     Returns:
@@ -73,98 +71,31 @@ def fingerprint_scenarios(
     """
     if not scenarios:
         return []
-    platform, options = scenarios[0].platform, dict(options or {})
+    platform = scenarios[0].platform
+    options = dict(options or {}) if pool is None else pool.options
     salt = _salt(platform, options)
     keys = [hashlib.sha256(f"{s.sha256()} {salt}".encode()).hexdigest() for s in scenarios]
-    done = _read_log(log)
+    file, done = _open_log(log)
     open_rows = [i for i, key in enumerate(keys) if key not in done]
     found: dict[int, Replayed] = {}
     for i, key in enumerate(keys):
         if key in done:
             found[i] = _apply(scenarios[i], done[key])
-    log.parent.mkdir(parents=True, exist_ok=True)
     progress(len(found), len(scenarios))
-    with open(log, "ab") as file:
+    jobs = _jobs(scenarios, open_rows)
+    used = nullcontext(pool) if pool else JobPool(platform, options, min(workers, len(jobs)))
+    with file, used as processes:
 
         def keep(i: int, entry: dict[str, Any]) -> None:
             found[i] = _apply(scenarios[i], entry)
             if not found[i].error:
-                file.write(json.dumps({"key": keys[i], **entry}).encode() + b"\n")
-                file.flush()
+                file.append(json.dumps({"key": keys[i], **entry}).encode())
             progress(len(found), len(scenarios))
 
-        jobs = _jobs(scenarios, open_rows)
-        for rows, entries in run_jobs(
-            _replay,
-            [([scenarios[i] for i in rows], check) for rows in jobs],
-            jobs,
-            platform,
-            options,
-            workers,
-        ):
+        for rows, entries in processes.run(_replay, jobs, lambda rows: ([scenarios[i] for i in rows], check)):
             for i, entry in zip(rows, entries, strict=True):
                 keep(i, entry)
     return [found[i] for i in range(len(scenarios))]
-
-
-def run_jobs[J](
-    work: Callable[..., Any],
-    arguments: Sequence[tuple],
-    jobs: Sequence[J],
-    platform: str,
-    options: Mapping[str, Any],
-    workers: int,
-) -> Iterable[tuple[J, Any]]:
-    """Runs `work(*arguments)` for every job in processes that each hold one simulator, as they finish.
-
-    Raises:
-        SimulatorError: the simulator cannot be made, or a process died.
-    """
-    if not jobs:
-        return
-    # Spawned, because OpenGL contexts and threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        max(1, min(workers, len(jobs))), context, _start, (platform, dict(options))
-    ) as pool:
-        futures: dict[Future, J] = {
-            pool.submit(_guarded, work, a): job for a, job in zip(arguments, jobs, strict=True)
-        }
-        try:
-            for future in as_completed(futures):
-                refusal, result = future.result()
-                if refusal:
-                    raise SimulatorError(refusal)
-                yield futures[future], result
-        except BrokenProcessPool:
-            raise SimulatorError(
-                "a worker process died (out of memory, or a crash in native code). What it had finished is "
-                "kept: run the command again, with fewer workers if memory was short"
-            ) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def simulator_of_worker() -> Simulator:
-    """The simulator of this worker process, made when first asked for."""
-    global _simulator
-    if _simulator is None:
-        _simulator = make_simulator(_platform, **_options)
-    return _simulator
-
-
-def _start(platform: str, options: dict[str, Any]) -> None:
-    global _platform, _options
-    _platform, _options = platform, options
-
-
-def _guarded(work: Callable[..., Any], arguments: tuple) -> tuple[str, Any]:
-    """The result, or why the simulator cannot be made, which concerns every job."""
-    try:
-        simulator_of_worker()
-    except SimulatorError as err:
-        return str(err), None
-    return "", work(*arguments)
 
 
 def _replay(scenarios: Sequence[Scenario], check: ResetCheck | None) -> list[dict[str, Any]]:
@@ -225,31 +156,30 @@ def _jobs(scenarios: Sequence[Scenario], rows: Sequence[int]) -> list[list[int]]
 
 
 def _salt(platform: str, options: Mapping[str, Any]) -> str:
-    versions = {name: installed(name) for name in REQUIRED.get(platform, {})}
-    named = [options.get(name) for name in ("assets_dir", "robotwin_root")]
-    known = [os.environ.get(name) for name in ("ROBORECOVER_LIBERO_ASSETS", "ROBOTWIN_ROOT")]
-    return json.dumps([versions, named, known])
+    found = platform_named(platform)
+    versions = {name: installed(name) for name in found.required_versions}
+    return json.dumps([versions, found.salt(options)])
 
 
-def _read_log(log: Path) -> dict[str, dict[str, Any]]:
-    """Finished scenarios by key; a last line that a crash cut short is left out."""
-    found = {}
+def _open_log(log: Path) -> tuple[AppendOnly, dict[str, dict[str, Any]]]:
+    """The log, and finished scenarios by key; a last line that a crash cut short goes.
+
+    Raises:
+        ScenarioError: it is damaged, cannot be written, or another process has it open.
+    """
     try:
-        lines = log.read_bytes().splitlines(keepends=True)
-    except FileNotFoundError:
-        return found
-    for number, line in enumerate(lines):
+        file = AppendOnly(log)
+    except OSError as err:
+        raise ScenarioError(f"{log} cannot be written: {err}. Name another working folder") from err
+    except InUseError as err:
+        raise ScenarioError(f"{err}; stop that one first, or name another working folder") from None
+    found = {}
+    for number, line in enumerate(file.lines(), 1):
         try:
-            if not line.endswith(b"\n"):
-                raise ValueError
             entry = json.loads(line)
             found[entry["key"]] = entry
         except (ValueError, KeyError, TypeError):
-            if number + 1 < len(lines):
-                raise ScenarioError(
-                    f"{log}, line {number + 1} is damaged; delete the file to start again"
-                ) from None
-    if lines and not lines[-1].endswith(b"\n"):
-        with open(log, "r+b") as file:
-            file.truncate(sum(map(len, lines[:-1])))
-    return found
+            file.close()
+            raise ScenarioError(f"{log}, line {number} is damaged; delete the file to start again") from None
+    file.cut()
+    return file, found

@@ -191,7 +191,7 @@ class FrameStore(Mapping[str, LastFrames]):
 
 def _check(found: LastFrames) -> None:
     for camera, frames in found.png.items():
-        where = f"scenario {found.scenario_id:.140}, camera {camera:.80}"
+        where = f"scenario {found.scenario_id:.200}, camera {camera:.80}"
         if not 1 <= len(frames) <= MAX_FRAMES:
             raise ScenarioError(f"{where}: {len(frames)} frames; there may be 1 to {MAX_FRAMES}")
         for i, frame in enumerate(frames):

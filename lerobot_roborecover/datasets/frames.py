@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.walk import walk
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.simulators.base import Observation, Simulator
+    from lerobot_roborecover.platforms.simulator import Observation, Simulator
 
 KEPT = 5
 """Frames a camera (paper, "Replay-Based Data Checking": the mean SSIM of the final five)."""
@@ -63,13 +65,9 @@ def last_frames(simulator: Simulator, scenario: Scenario) -> LastFrames:
         scenario: what to replay; the simulator is left at its recovery point.
     """
     tail = Tail(scenario.platform)
-    simulator.reset(scenario.task, scenario.reset)
-    steps = len(scenario.prefix)
-    for step in range(steps + 1):
-        if step > steps - KEPT:
+    for step in walk(simulator, scenario.rollout):
+        if step > len(scenario.prefix) - KEPT:
             tail.add(simulator.observe())
-        if step < steps:
-            simulator.step(scenario.prefix[step])
     return tail.frames(scenario)
 
 
@@ -78,9 +76,8 @@ def camera_pictures(platform: str, observation: Observation) -> dict[str, np.nda
     pixels = observation.get("pixels", {})
     if not isinstance(pixels, Mapping):
         return {"observation.image": np.array(pixels)}
-    # LIBERO's leave the simulator rotated by 180 degrees; LeRobot's processor of the platform turns them.
-    turn = slice(None, None, -1 if platform == "libero" else 1)
-    return {f"observation.images.{name}": np.array(p[turn, turn]) for name, p in pixels.items()}
+    upright = platform_named(platform).upright
+    return {f"observation.images.{name}": np.array(upright(p)) for name, p in pixels.items()}
 
 
 def _encode(picture: np.ndarray) -> bytes:

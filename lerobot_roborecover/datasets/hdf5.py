@@ -33,7 +33,14 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         yield file
 
 
-def read_array(group: Any, name: str, *, ndim: int | None = None, width: int | None = None) -> np.ndarray:
+def read_array(
+    group: Any,
+    name: str,
+    *,
+    ndim: int | None = None,
+    width: int | None = None,
+    rows: tuple[int, str] | None = None,
+) -> np.ndarray:
     """An array below a group, whole.
 
     Args:
@@ -41,6 +48,7 @@ def read_array(group: Any, name: str, *, ndim: int | None = None, width: int | N
         name: path below it.
         ndim: number of axes it must have.
         width: length its last axis must have.
+        rows: how many there must be, and of what there are as many.
 
     Raises:
         ScenarioError: it is missing, lies in another file, is too large or of another shape, or is not
@@ -66,6 +74,11 @@ def read_array(group: Any, name: str, *, ndim: int | None = None, width: int | N
     if (ndim is not None and node.ndim != ndim) or (width is not None and node.shape[-1:] != (width,)):
         raise ScenarioError(
             f"{where} has shape {node.shape}; expected {ndim} axes, the last of {width or 'any'}"
+        )
+    if rows is not None and node.shape[:1] != rows[:1]:
+        raise ScenarioError(
+            f"{where} has {node.shape[0] if node.shape else 'no'} rows, but there are {rows[0]} {rows[1]}: "
+            "which belongs to which is not known. Take the file from its source again"
         )
     values = node[()]
     if values.dtype.kind == "f" and not np.isfinite(values).all():

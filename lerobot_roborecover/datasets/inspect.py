@@ -12,8 +12,11 @@ import numpy as np
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER
 from lerobot_roborecover.datasets.load import ScenarioSet
 from lerobot_roborecover.datasets.schema import package_versions
+from lerobot_roborecover.platforms.robot_fingerprint import NAME, is_robot_entry
+from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.platforms.walk import walk
 from lerobot_roborecover.scenario import DeviationType, Pose, Scenario, ScenarioError, Stage
-from lerobot_roborecover.simulators.base import Simulator
+from lerobot_roborecover.words import counted
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,9 @@ class Moment:
 
 def replay_moments(simulator: Simulator, scenario: Scenario) -> Iterator[Moment]:
     """Every state of a scenario's prefix, from the reset to the recovery point."""
-    simulator.reset(scenario.task, scenario.reset)
-    for step, action in enumerate(scenario.prefix):
-        yield Moment(step, simulator.render(), simulator.bodies(), action)
-        simulator.step(action)
-    yield Moment(len(scenario.prefix), simulator.render(), simulator.bodies(), None)
+    for step in walk(simulator, scenario.rollout):
+        following = scenario.prefix[step] if step < len(scenario.prefix) else None
+        yield Moment(step, simulator.render(), simulator.bodies(), following)
 
 
 def summary(found: ScenarioSet) -> str:
@@ -45,8 +46,8 @@ def summary(found: ScenarioSet) -> str:
     lengths = np.array([len(s.prefix) for s in scenarios])
     lines = [
         f"{found.source}" + (f" at {found.revision}" if found.revision else ""),
-        f"platform {found.platform}, {len(scenarios)} scenarios, "
-        f"{len({(s.task.suite, s.task.name) for s in scenarios})} tasks, licence "
+        f"platform {found.platform}, {counted(len(scenarios), 'scenario')}, "
+        f"{counted(len({(s.task.suite, s.task.name) for s in scenarios}), 'task')}, licence "
         f"{found.manifest.get('license') or 'not given'}",
         f"prefixes {lengths.min()} to {lengths.max()} actions, median {np.median(lengths):g}, mean "
         f"{lengths.mean():.1f}",
@@ -72,9 +73,14 @@ def summary(found: ScenarioSet) -> str:
     counts = Counter((s.stage, s.deviation) for s in scenarios)
     rows = [[stage.value, *(counts[stage, kind] or "-" for kind in DeviationType)] for stage in Stage]
     lines += ["", *_table(["stage", *(kind.value for kind in DeviationType)], rows)]
-    versions = package_versions(scenarios)
+    versions = _in_short(package_versions(scenarios))
     lines += ["", *(f"{name} {', '.join(values)}" for name, values in versions.items())]
     return "\n".join(lines)
+
+
+def _in_short[V](versions: Mapping[str, V]) -> dict[str, V]:
+    """Of a robot's many entries only the first, its name."""
+    return {key: value for key, value in versions.items() if key == NAME or not is_robot_entry(key)}
 
 
 def describe(scenario: Scenario) -> str:
@@ -88,7 +94,7 @@ def describe(scenario: Scenario) -> str:
         f"source       {scenario.source.value}"
         + (f" ({scenario.source_policy})" if scenario.source_policy else ""),
         f"split        {scenario.split}" + (f", cluster {scenario.cluster}" if scenario.cluster else ""),
-        f"prefix       {len(scenario.prefix)} actions of {scenario.prefix.shape[1]}, settling "
+        f"prefix       {counted(len(scenario.prefix), 'action')} of {scenario.prefix.shape[1]}, settling "
         f"{reset.settle_steps}; then up to {task.horizon} steps",
         f"reset        seed {reset.seed}, init state {reset.init_state_index}, "
         f"{len(reset.fixtures)} fixtures",
@@ -97,7 +103,7 @@ def describe(scenario: Scenario) -> str:
     if mark is None:
         lines.append("fingerprint  none: the handoff cannot be checked")
     else:
-        versions = ", ".join(f"{k} {v}" for k, v in mark.versions.items())
+        versions = ", ".join(f"{k} {v}" for k, v in _in_short(mark.versions).items())
         lines.append(f"fingerprint  {len(mark.bodies)} bodies, state {mark.state_sha256[:16]}, {versions}")
     return "\n".join(lines)
 

@@ -132,20 +132,28 @@ def load_scenarios(
 
 def builtin_names() -> list[str]:
     """Names of the scenario sets that come with this package."""
+    return sorted(_builtin())
+
+
+def _builtin() -> dict[str, Path]:
+    """Folder of each set of the package by its name; a study's are in its `scenarios`."""
     data = importlib.resources.files("lerobot_roborecover").joinpath("data")
     if not data.is_dir():
-        return []
-    return sorted(d.name for d in data.iterdir() if d.joinpath(FOLDER, MANIFEST_FILE).is_file())
+        return {}
+    roots = [root for d in data.iterdir() for root in (d, d.joinpath("scenarios"))]
+    found = [Path(str(r)) for r in roots if r.joinpath(FOLDER, MANIFEST_FILE).is_file()]
+    return {(r.parent if r.name == "scenarios" else r).name: r for r in found}
 
 
 def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path, str | None]:
     """The folder of a source, downloaded where needed, and the Hub commit it is of."""
     text = os.fspath(source)
-    builtin = builtin_names()
+    found = _builtin()
+    builtin = sorted(found)
     if isinstance(source, str) and text in builtin:
         if Path(text).is_dir():
             logger.warning("scenarios %r: taking the built-in set; for the folder say ./%s", text, text)
-        root = Path(str(importlib.resources.files("lerobot_roborecover").joinpath("data", text)))
+        root = found[text]
     elif Path(text).expanduser().is_dir():
         root = Path(text).expanduser()
     elif isinstance(source, str) and _HUB_ID.fullmatch(text):

@@ -24,8 +24,10 @@ from huggingface_hub.hf_api import RepoFile
 
 from lerobot_roborecover.datasets.card import GENERATED, CardFiles, make_card
 from lerobot_roborecover.datasets.contents import check_file, list_files
+from lerobot_roborecover.datasets.pull import validate
 from lerobot_roborecover.datasets.retries import ATTEMPTS, HubUnreachable, again
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.words import counted
 
 LEROBOT_TAG = "v3.0"
 """LeRobot loads a dataset at the tag of its own format version."""
@@ -54,6 +56,8 @@ class PublishConfig:
     """Put a grid of recovery frames into the card, where the dataset holds frames."""
     frames: Mapping[str, np.ndarray] | None = None
     """(H, W, 3) uint8 by scenario id: rendered pictures for the grid instead."""
+    called: str = ""
+    """What the plan calls the dataset; its folder by default."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +91,22 @@ class PublishPlan:
         tags = ", ".join(f"{t} (moved)" if moved else t for t, moved in self.tags.items())
         if self.unreachable:
             return [
-                f"dataset   {self.root}",
+                f"dataset   {self.config.called or self.root}",
                 f"to        {self.config.repo_id}; if it does not exist, {where} is made",
                 f"unknown   what is there already: {self.unreachable}",
-                f"upload    at most {len(self.add)} files, {self.bytes / 1e6:.1f} MB",
+                f"upload    at most {counted(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB",
                 *(f"  + {name}" for name in self.add),
                 "delete    files that are there and not in the dataset",
                 f"tags      {tags}; refused where the version is published already and differs",
                 f"licence   {self.card.license}",
             ]
         return [
-            f"dataset   {self.root}",
+            f"dataset   {self.config.called or self.root}",
             f"to        {self.config.repo_id}, {where}" + (f" at {self.head}" if self.head else ""),
-            f"upload    {len(self.add)} files, {self.bytes / 1e6:.1f} MB; {self.same} are there already",
+            f"upload    {counted(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB; "
+            f"{self.same} are there already",
             *(f"  + {name}" for name in self.add),
-            f"delete    {len(self.delete)} files",
+            f"delete    {counted(len(self.delete), 'file')}",
             *(f"  - {name}" for name in self.delete),
             f"tags      {tags}",
             f"licence   {self.card.license}",
@@ -131,8 +136,7 @@ def plan_publish(
         ScenarioError: the dataset is not valid, there is no licence, or the version is published already.
     """
     root = Path(root)
-    if not _VERSION.fullmatch(config.version):
-        raise ScenarioError(f"version {config.version!r:.40} is not like 1.0 or 1.0.0")
+    check_version(config.version)
     names = list_files(root)
     for name in names:
         check_file(root, name)
@@ -146,6 +150,7 @@ def plan_publish(
         pictures=config.pictures,
         frames=config.frames,
     )
+    validate(root, thorough=True)
     local = {name: root / name for name in names}
     local |= {
         name: data for name, data in card.files.items() if name not in local or _replaceable(local[name])
@@ -196,6 +201,16 @@ def plan_publish(
         tags,
         unreachable,
     )
+
+
+def check_version(version: str) -> None:
+    """Checks how a version is written.
+
+    Raises:
+        ScenarioError: it is not like 1.0 or 1.0.0.
+    """
+    if not _VERSION.fullmatch(version):
+        raise ScenarioError(f"version {version!r:.40} is not like 1.0 or 1.0.0")
 
 
 def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda done, total: None) -> Published:

@@ -25,6 +25,7 @@ from lerobot_roborecover.datasets.schema import (
     SCENARIOS_FILE,
 )
 from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, read_trajectories
+from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import check_new, new_folder
 
@@ -102,8 +103,12 @@ def pull_dataset(
     return Pulled(out, commit, len(entries), size)
 
 
-def validate(root: Path) -> None:
-    """Reads what a dataset says of itself.
+def validate(root: Path, *, thorough: bool = False) -> None:
+    """Reads what a dataset says of itself, and counts its videos' frames.
+
+    Args:
+        root: the dataset's folder.
+        thorough: look at the time of every video frame.
 
     Raises:
         ScenarioError: it is no valid dataset of this package.
@@ -112,10 +117,11 @@ def validate(root: Path) -> None:
     from lerobot_roborecover.datasets.read import read_scenarios
 
     if (root / FOLDER / TRAJECTORIES_FILE).is_file():
-        read_trajectories(root)
-        return
-    read_scenarios(root)
-    FrameStore(root)
+        steps = [row.steps for row in read_trajectories(root).rows]
+    else:
+        steps = [len(s.prefix) for s in read_scenarios(root)]
+        FrameStore(root)
+    check_frames(root, steps, thorough=thorough)
 
 
 def _wanted(where: str, entries: Sequence[RepoFile], evaluation_only: bool) -> list[RepoFile]:

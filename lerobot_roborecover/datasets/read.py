@@ -37,6 +37,7 @@ from lerobot_roborecover.datasets.schema import (
     counts,
 )
 from lerobot_roborecover.datasets.write import check_set
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Fingerprint, Pose, Reset, Scenario, ScenarioError, Task
 
 _FETCH_AGAIN = "Fetch or write the dataset again"
@@ -144,6 +145,7 @@ def _to_scenario(record: Mapping[str, Any], prefix: np.ndarray) -> Scenario:
             f"field prefix: {len(prefix)} numbers are not prefix_steps = {steps} actions of action_dim = "
             f"{width}"
         )
+    platform_named(record["platform"]).check_width(width, f"scenario {record['id']!s:.140}")
     with _at("field provenance"):
         try:
             provenance = json.loads(record["provenance"], parse_constant=_refuse_constant)

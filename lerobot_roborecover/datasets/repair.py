@@ -30,8 +30,10 @@ from lerobot_roborecover.datasets.trajectories import (
     read_trajectories,
 )
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
+from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.words import counted
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,14 @@ class Repaired:
 
     lines: tuple[str, ...]
     changed: bool
+    ids: tuple[str, ...] = ()
+    """Of the scenarios, by episode; empty for trajectories."""
 
 
 def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: bool = False) -> Repaired:
-    """Rebuilds `meta/roborecover/` of a dataset from its episodes and the datasets they came from.
+    """Rebuilds the scenarios or trajectories of a dataset from its episodes and the datasets they came from.
+
+    What was known of candidates, decided and voted, `build.repair.repair_dataset` brings back on top.
 
     Args:
         root: the dataset that a tool has made.
@@ -54,6 +60,25 @@ def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: boo
         ScenarioError: an episode is in none of the sources, or was changed itself; nothing is changed then.
     """
     root = Path(root)
+    episodes = read_edited(root, sources)
+    kinds = {(Path(s) / FOLDER / TRAJECTORIES_FILE).is_file() for s in sources}
+    if len(kinds) > 1:
+        raise ScenarioError(
+            "some sources are scenario datasets and some trajectory datasets; repair needs one kind"
+        )
+    if kinds.pop():
+        return _repair_trajectories(
+            root, episodes, [read_trajectories(s, videos=False) for s in sources], dry_run
+        )
+    return _repair_scenarios(root, episodes, sources, dry_run)
+
+
+def read_edited(root: Path, sources: Sequence[str]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The episodes of a dataset that is to be repaired: exact actions and scenario rows of each.
+
+    Raises:
+        ScenarioError: there are none, their videos have other numbers of frames, or no source is named.
+    """
     if not (root / "data").is_dir():
         raise ScenarioError(f"{root} has no data/: it holds no episodes, and nothing to repair from")
     if not sources:
@@ -61,14 +86,8 @@ def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: boo
     episodes = read_exact(root)
     if not episodes:
         raise ScenarioError(f"{root} has no episodes")
-    kinds = {(Path(s) / FOLDER / TRAJECTORIES_FILE).is_file() for s in sources}
-    if len(kinds) > 1:
-        raise ScenarioError(
-            "some sources are scenario datasets and some trajectory datasets; repair needs one kind"
-        )
-    if kinds.pop():
-        return _repair_trajectories(root, episodes, [read_trajectories(s) for s in sources], dry_run)
-    return _repair_scenarios(root, episodes, sources, dry_run)
+    check_frames(root, [len(actions) for actions, _ in episodes], thorough=True)
+    return episodes
 
 
 def _repair_scenarios(
@@ -95,11 +114,12 @@ def _repair_scenarios(
     manifests = [found.manifest for found in sets]
     total = sum(len(found) for found in sets)
     lines = [
-        f"{len(episodes)} episodes found again in {len(sets)} sources by their exact actions",
-        f"scenarios.parquet: {len(chosen)} of {total} scenarios, in the order of the episodes",
+        f"{counted(len(episodes), 'episode')} found again in {counted(len(sets), 'source')} by "
+        "their exact actions",
+        f"scenarios.parquet: {len(chosen)} of {counted(total, 'scenario')}, in the order of the episodes",
     ]
     if dry_run:
-        return Repaired((*lines, "dry run: nothing was changed"), False)
+        return Repaired((*lines, "dry run: nothing was changed"), False, tuple(names))
     moved = _renumber(root, list(range(len(chosen))))
     licenses = {m.get("license") for m in manifests}
     write_scenarios(
@@ -109,7 +129,7 @@ def _repair_scenarios(
         license=licenses.pop() if len(licenses) == 1 else None,
         frames=_last_frames(sources, chosen),
     )
-    return Repaired((*lines, f"{SCENARIO_INDEX}: {moved} frames renumbered"), True)
+    return Repaired((*lines, f"{SCENARIO_INDEX}: {counted(moved, 'frame')} renumbered"), True, tuple(names))
 
 
 def _last_frames(sources: Sequence[str], scenarios: Sequence[Scenario]) -> Iterator[LastFrames]:
@@ -148,8 +168,9 @@ def _repair_trajectories(
             raise ScenarioError(f"two sources have different scenarios, or splits, under the id {link.id!r}")
         rows.append(replace(row, scenario_index=-1 if link is None else list(links).index(link.id)))
     lines = [
-        f"{len(episodes)} episodes found again in {len(sets)} sources by their exact actions",
-        f"{TRAJECTORIES_FILE}: {len(rows)} trajectories of {len(links)} scenarios",
+        f"{counted(len(episodes), 'episode')} found again in {counted(len(sets), 'source')} by "
+        "their exact actions",
+        f"{TRAJECTORIES_FILE}: {counted(len(rows), 'trajectory')} of {counted(len(links), 'scenario')}",
     ]
     if dry_run:
         return Repaired((*lines, "dry run: nothing was changed"), False)
@@ -166,7 +187,7 @@ def _repair_trajectories(
         license=licenses.pop() if len(licenses) == 1 else None,
     )
     read_trajectories(root)
-    return Repaired((*lines, f"{SCENARIO_INDEX}: {moved} frames renumbered"), True)
+    return Repaired((*lines, f"{SCENARIO_INDEX}: {counted(moved, 'frame')} renumbered"), True)
 
 
 def _one(number: int, index: np.ndarray) -> int:

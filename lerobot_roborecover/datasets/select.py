@@ -102,8 +102,9 @@ def validate_for(scenarios: Sequence[Scenario], platform: str) -> None:
         ScenarioError: there are none, they are of another platform, or a suite or task is unknown to the
             platform.
     """
-    from lerobot_roborecover.simulators.catalog import check_task
+    from lerobot_roborecover.platforms import platform_named
 
+    own = platform_named(platform)
     if not scenarios:
         raise ScenarioError("there are no scenarios to run; check the selection")
     for scenario in scenarios:
@@ -114,9 +115,10 @@ def validate_for(scenarios: Sequence[Scenario], platform: str) -> None:
             )
     checked = set()
     for scenario in scenarios:
+        own.check_scenario(scenario)
         if scenario.task not in checked:
             try:
-                check_task(scenario.task)
+                own.check_task(scenario.task)
             except ScenarioError as err:
                 raise ScenarioError(f"scenario {scenario.id}: {err}") from None
             checked.add(scenario.task)

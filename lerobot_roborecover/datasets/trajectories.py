@@ -19,6 +19,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets.files import read_bytes, what_it_is
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.scenario import Pose, Reset, ScenarioError, Task
 
 TRAJECTORIES_FILE = "trajectories.json"
@@ -111,8 +112,13 @@ class TrajectorySet:
         return [actions for actions, _ in read_exact(self.root)]
 
 
-def read_trajectories(root: str | os.PathLike[str]) -> TrajectorySet:
+def read_trajectories(root: str | os.PathLike[str], *, videos: bool = True) -> TrajectorySet:
     """Reads and checks a trajectory dataset's own metadata; trusts nothing in it.
+
+    Args:
+        root: the dataset's folder.
+        videos: refuse one whose videos have another number of frames than steps; False for whoever looks at
+            the metadata alone.
 
     Raises:
         ScenarioError: names the file and the field.
@@ -154,6 +160,8 @@ def read_trajectories(root: str | os.PathLike[str]) -> TrajectorySet:
             f"trajectories and {len(links)} scenarios. Fetch or write the dataset again"
         )
     _check_leakage(path, links)
+    if videos:
+        check_frames(root, [row.steps for row in rows])
     return TrajectorySet(root, kind, platform, links, rows, found)
 
 
@@ -199,7 +207,9 @@ def read_exact(root: Path) -> list[tuple[np.ndarray, np.ndarray]]:
         rows = zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
         for episode, frame, action, index in rows:
             value = index[0] if isinstance(index, list) else index
-            found.setdefault(episode, []).append((frame, np.array(action, dtype=np.float64), value))
+            found.setdefault(episode, []).append(
+                (frame, np.atleast_1d(np.asarray(action, np.float64)), value)
+            )
     episodes = []
     for number in sorted(found):
         frames = sorted(found[number], key=lambda f: f[0])

@@ -7,6 +7,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -26,9 +27,9 @@ from lerobot_roborecover.datasets.trajectories import (
     TrajectoryRow,
     actions_sha256,
 )
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import (
     MAX_ACTION_MAGNITUDE,
-    PLATFORM_ACTION_DIMS,
     Reset,
     Scenario,
     ScenarioError,
@@ -121,19 +122,19 @@ def write_trajectories(
 def _write_episodes(
     root: Path, kind: str, trajectories: Iterable[Trajectory], fps: int, splits: Mapping[str, str]
 ) -> tuple[list[ScenarioLink], list[TrajectoryRow], Counter]:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX, features_of
+    from lerobot_roborecover.datasets.encoding import Episode, EpisodeWriter
 
     links: dict[str, ScenarioLink] = {}
     rows: list[TrajectoryRow] = []
     labels: Counter = Counter()
-    dataset: Any = None
+    writer: EpisodeWriter | None = None
     platform = ""
-    try:
+    with ExitStack() as stack:
         for number, trajectory in enumerate(trajectories):
             _check(kind, number, trajectory, platform or trajectory.task.platform)
             platform = trajectory.task.platform
+            if writer is None:
+                writer = stack.enter_context(EpisodeWriter(root, fps, platform))
             index = -1
             if trajectory.scenario is not None:
                 scenario = trajectory.scenario
@@ -144,46 +145,17 @@ def _write_episodes(
                     )
                 index = list(links).index(scenario.id)
                 labels.update((link.split, int(v)) for v in trajectory.labels or ())
-            written = 0
-            for frame in trajectory.frames:
-                if written == len(trajectory.actions):
-                    written += 1
-                    break
-                if dataset is None:
-                    features = features_of(frame, trajectory.actions.shape[1])
-                    if kind == "monitor":
-                        features[LABEL] = {"dtype": "float32", "shape": (1,), "names": None}
-                    dataset = LeRobotDataset.create(
-                        repo_id=f"roborecover/{root.name.strip('.')}",
-                        fps=fps,
-                        features=features,
-                        root=root,
-                        robot_type=platform,
-                        streaming_encoding=True,
-                    )
-                action = trajectory.actions[written]
-                values = {
-                    **frame,
-                    "action": action.astype(np.float32),
-                    EXACT_ACTION: action,
-                    SCENARIO_INDEX: np.array([index], dtype=np.int64),
-                    "task": trajectory.task.instruction,
-                }
-                if kind == "monitor":
-                    values[LABEL] = np.array([trajectory.labels[written]], dtype=np.float32)
-                dataset.add_frame(values)
-                written += 1
-            if written != len(trajectory.actions):
-                raise ScenarioError(
-                    f"trajectory {number}: {len(trajectory.actions)} actions, but "
-                    f"{written if written < len(trajectory.actions) else 'more'} frames; there is one frame "
-                    "before each action"
+            writer.write(
+                Episode(
+                    f"trajectory {number}",
+                    trajectory.actions,
+                    trajectory.frames,
+                    index,
+                    trajectory.task.instruction,
+                    {LABEL: np.asarray(trajectory.labels)} if trajectory.labels is not None else {},
                 )
-            dataset.save_episode()
+            )
             rows.append(_row(trajectory, index))
-    finally:
-        if dataset is not None:
-            dataset.finalize()
     if not rows:
         raise ScenarioError("there are no trajectories; a dataset needs at least one")
     return list(links.values()), rows, labels
@@ -218,7 +190,7 @@ def _reset_dict(reset: Reset) -> dict[str, Any]:
 def _check(kind: str, number: int, trajectory: Trajectory, platform: str) -> None:
     where = f"trajectory {number}"
     actions = np.asarray(trajectory.actions)
-    widths = PLATFORM_ACTION_DIMS[trajectory.task.platform]
+    widths = platform_named(trajectory.task.platform).action_widths
     if trajectory.task.platform != platform:
         raise ScenarioError(f"{where} is of {trajectory.task.platform}, the first of {platform}")
     if actions.dtype != np.float64 or actions.ndim != 2 or not len(actions) or actions.shape[1] not in widths:

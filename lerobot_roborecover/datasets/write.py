@@ -30,7 +30,7 @@ from lerobot_roborecover.datasets.schema import (
     to_row,
 )
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import new_file, new_folder, write_whole
+from lerobot_roborecover.whole import forget_stale, new_file, new_folder, write_whole
 
 _ROWS_PER_GROUP = 64
 """Rows converted at a time: bounds memory where scenarios carry frames."""
@@ -89,6 +89,7 @@ def _write_folder(
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{FRAMES_FOLDER}.{os.getpid()}.tmp"
     shutil.rmtree(temporary, ignore_errors=True)
+    forget_stale(folder / FRAMES_FOLDER)
     try:
         names = write_frames(temporary, frames)
         with new_file(folder / SCENARIOS_FILE) as path, open(path, "wb") as file:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from lerobot_roborecover.errors import RoboRecoverError
 
-class DemoError(RuntimeError):
+
+class DemoError(RoboRecoverError, RuntimeError):
     """The demo cannot run or go on; the message says why and what to do."""

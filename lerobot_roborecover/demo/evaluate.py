@@ -13,8 +13,9 @@ from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
-from lerobot_roborecover.env.parent import end_with_parent
-from lerobot_roborecover.evaluate.progress import LogTail, ProgressLine, Tally
+from lerobot_roborecover.rounding import policy_kernels
+from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
+from lerobot_roborecover.workers.parent import end_with_parent
 
 _POLL_S = 0.5
 _STOP_S = 10.0
@@ -76,7 +77,8 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
         return
     folder.mkdir(parents=True, exist_ok=True)
     output = folder / "lerobot-eval.log"
-    environment = {"MUJOCO_GL": "egl", "OMP_NUM_THREADS": "1", **os.environ}
+    # The kernels win over the environment: the table is to be the same on every machine that has them.
+    environment = {"MUJOCO_GL": "egl", **os.environ, **policy_kernels()}
     if Path(settings.policy).is_dir():
         # Nothing is needed from the Hub, and a machine without network should not wait for it.
         environment.setdefault("HF_HUB_OFFLINE", "1")

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from lerobot_roborecover.analysis.pictures import render_frames
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo.evaluate import eval_command, evaluate
 from lerobot_roborecover.demo.page import write_page
-from lerobot_roborecover.demo.pictures import render_frames
 from lerobot_roborecover.demo.settings import DemoSettings, claim_folder
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.evaluate.progress import Tally
+from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.trials.progress import Tally
 
 STARTS = ("recovery", "initial")
 
@@ -43,8 +43,11 @@ def run_demo(settings: DemoSettings) -> Path:
     for start in STARTS:
         evaluate(settings, found.platform, ids, start)
     tallies = [Tally(start, ids, settings.trials) for start in STARTS]
-    rows = [asdict(row) for row in read_trial_log(settings.trial_log)]
-    rows = [row for row in rows if any(tally.wanted(row) for tally in tallies)]
+
+    def wanted(row: TrialRow) -> bool:
+        return any(tally.wanted(asdict(row)) for tally in tallies)
+
+    rows = [asdict(row) for row in read_trial_log(settings.trial_log) if wanted(row)]
     summary = summarise(rows, settings.trials)
     print(f"\n{format_table(summary)}\n", flush=True)
     frames, problem = {}, "they were not asked for"
@@ -53,7 +56,15 @@ def run_demo(settings: DemoSettings) -> Path:
         frames, problem = render_frames(scenarios, settings.out / "frames")
         if problem:
             _say(f"pictures are missing: {problem}")
-    page = write_page(settings.out / "index.html", scenarios, rows, summary, frames, problem, commands)
+    page = write_page(
+        settings.trial_log,
+        settings.out,
+        wanted=wanted,
+        trials=settings.trials,
+        frames=frames,
+        problem=problem,
+        commands=commands,
+    )
     for label, path in (("page", page), ("trial log", settings.trial_log)):
         print(f"{label:<10}{path}")
     for start in STARTS:

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.doctor.probe import run_probe
-from lerobot_roborecover.doctor.report import Check, Status
+from lerobot_roborecover.platforms.findings import Check, Status
+from lerobot_roborecover.platforms.probe import run_probe
 
 _RENDER_TIMEOUT_S = 60.0
 _LOW_DISK_GB = 5.0
@@ -47,7 +47,7 @@ def check_opengl() -> Check:
 
 def _render(backend: str) -> dict[str, Any]:
     environment = {"MUJOCO_GL": backend} if backend else {}
-    return run_probe("probe_render", timeout_s=_RENDER_TIMEOUT_S, environment=environment)
+    return run_probe("doctor.probe_render", timeout_s=_RENDER_TIMEOUT_S, environment=environment)
 
 
 def check_gpu(probe: Mapping[str, Any]) -> Check:

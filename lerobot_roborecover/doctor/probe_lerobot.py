@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from lerobot_roborecover.doctor.probe import answer
+from lerobot_roborecover.platforms.probe import answer
 
 
 def _discovered() -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from lerobot_roborecover.doctor.probe import answer
+from lerobot_roborecover.platforms.probe import answer
 
 _SCENE = """
 <mujoco>

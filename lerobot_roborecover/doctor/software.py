@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
-from lerobot_roborecover import versions
-from lerobot_roborecover.doctor.report import Check, Status
+from lerobot_roborecover.platforms import versions
+from lerobot_roborecover.platforms.findings import Check, Status
 
 DISTRIBUTION = "lerobot_env_roborecover"
 MINIMUM_PYTHON = (3, 12)
@@ -27,11 +27,11 @@ def check_versions(platform_name: str, required: bool) -> list[Check]:
     """One check for each package on which the platform's scores depend.
 
     Args:
-        platform_name: a key of `versions.REQUIRED`.
+        platform_name: e.g. `libero`.
         required: a package that is not installed is a failure rather than a warning.
     """
     checks = []
-    for distribution, accepted in versions.REQUIRED[platform_name].items():
+    for distribution, accepted in versions.required(platform_name).items():
         name = f"{platform_name} scores: {distribution}"
         found = versions.installed(distribution)
         wanted = " or ".join(accepted)

@@ -1,35 +1,19 @@
-"""Checks of what has to be fetched: LIBERO's assets and the Hub."""
+"""Where scenarios come from: whether the Hub answers, and what recorded the shipped sets."""
 
 from __future__ import annotations
 
 import os
 import urllib.error
 import urllib.request
+from collections.abc import Mapping
 
-from lerobot_roborecover import versions
-from lerobot_roborecover.doctor.report import Check, Status
-from lerobot_roborecover.simulators.base import SimulatorError
-from lerobot_roborecover.simulators.libero_assets import find_assets
+from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
+from lerobot_roborecover.platforms.base import Platform
+from lerobot_roborecover.platforms.findings import Check, Status
 
 _HUB = "https://huggingface.co"
 _HUB_TIMEOUT_S = 5.0
 _TRUE = {"1", "on", "yes", "true"}
-
-
-def check_libero_assets(required: bool) -> Check:
-    """LIBERO's meshes and textures; nothing is downloaded here.
-
-    Args:
-        required: no complete folder is a failure rather than a warning.
-    """
-    name = "LIBERO assets"
-    status = Status.FAILURE if required else Status.WARNING
-    if versions.installed("hf-libero") is None:
-        return Check(name, status, "hf-libero is not installed", versions.install_command("libero"))
-    try:
-        return Check(name, Status.OK, str(find_assets(download=False)))
-    except SimulatorError as err:
-        return Check(name, status, "no complete folder", str(err))
 
 
 def check_hub() -> Check:
@@ -57,3 +41,11 @@ def check_hub() -> Check:
             name, Status.WARNING, f"{endpoint} does not answer ({why})", f"check the network; {remedy}"
         )
     return Check(name, Status.OK, f"{endpoint} answers")
+
+
+def recorded_by(platform: Platform) -> Mapping[str, str]:
+    """What recorded the set that a platform ships with, by name of package or file; nothing is downloaded."""
+    if platform.default_scenarios not in builtin_names():
+        return {}
+    recorded = next(iter(load_scenarios(platform.default_scenarios))).fingerprint
+    return recorded.versions if recorded else {}

@@ -1,1 +1,1 @@
-"""What lerobot-eval sees: env types, the scenario vector env, simulator workers, the trial log."""
+"""What lerobot-eval sees: env types, the scenario vector env, the life of a trial, the trial log."""

@@ -25,7 +25,7 @@ SIGNATURE = 21074.0
 """Exact in float32, and beyond any action (`scenario.MAX_ACTION_MAGNITUDE`)."""
 WIDTH = 5
 BY_RULE = -1
-"""Rollback by `scenario.default_rewind_steps`."""
+"""Rollback by `Platform.rewind_steps`."""
 _NOT_ASKED = -1.0
 
 

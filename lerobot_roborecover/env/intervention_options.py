@@ -1,12 +1,13 @@
-"""What a run's command line says of a composite policy: who is in it, and what makes its trials its own."""
+"""What a run says of a composite policy: who is in it, and what makes its trials its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lerobot_roborecover.scenario import Scenario, default_rewind_steps
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.scenario import TrialStart
 
 POLICY_TYPE = "roborecover_intervention"
 MODES = ("direct", "reversion", "correction", "monitor_reversion", "monitor_correction", "human")
@@ -29,12 +30,12 @@ class InterventionFacts:
         """Whether the mode asks for rollbacks."""
         return self.mode in _ROLLS_BACK
 
-    def rollback_steps(self, scenario: Scenario) -> int:
+    def rollback_steps(self, scenario: TrialStart) -> int:
         """How far back it may ask to go on a scenario; 0 where it does not."""
         if not self.rolls_back:
             return 0
         if self.rewind_steps is None:
-            return default_rewind_steps(scenario.platform, scenario.task.horizon)
+            return platform_named(scenario.platform).rewind_steps(scenario.task.horizon)
         return self.rewind_steps
 
     def name(self) -> str:
@@ -48,30 +49,3 @@ class InterventionFacts:
         if self.rolls_back:
             found["intervention_rewind_steps"] = "paper" if self.rewind_steps is None else self.rewind_steps
         return found
-
-
-def read_facts(value: Callable[[str], str | None], identity: Callable[[str], str]) -> InterventionFacts:
-    """Facts of a composite policy; members that its mode does not use are left out.
-
-    Args:
-        value: an option of the policy as text, e.g. `base.path`; None where nobody says.
-        identity: names a checkpoint by its content.
-    """
-    mode = value("mode") or "direct"
-    used = ["base"]
-    used += ["correction"] if mode.endswith("correction") else []
-    if mode.startswith("monitor") or (mode == "human" and value("monitor.path")):
-        used.append("monitor")
-    settings: dict[str, Any] = {}
-    for member in used:
-        path = value(f"{member}.path")
-        settings[member] = identity(path) if path else "unknown"
-        for option in ("n_action_steps", "rename_map", "threshold", "base_model"):
-            if value(f"{member}.{option}") not in (None, "", "{}"):
-                settings[f"{member}_{option}"] = value(f"{member}.{option}")
-    if "correction" in used:
-        settings["correction_steps"] = int(value("correction_steps") or 30)
-    if mode == "human":
-        settings["driver"] = value("driver") or ""
-    rewind = value("rewind_steps")
-    return InterventionFacts(mode, int(rewind) if rewind and rewind.isdigit() else None, settings)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lerobot_roborecover.env.directives import Controller, Directive
-from lerobot_roborecover.env.episode import RollbackResult
 from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.workers.messages import RollbackResult
 
 _KINDS = {Controller.CORRECTION: "correction", Controller.HUMAN: "takeover"}
 

@@ -7,13 +7,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import Start
 
+__all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
+
 GROUPS = ("suite", "cell", "source")
-
-
-class OptionError(ValueError):
-    """An option's value cannot be used; the message names it, the limit and the remedy."""
 
 
 @dataclass

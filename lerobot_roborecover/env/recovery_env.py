@@ -14,12 +14,12 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_roborecover.env.directives import BY_RULE
-from lerobot_roborecover.env.episode import RollbackResult
-from lerobot_roborecover.env.rewind import Trail
-from lerobot_roborecover.replay import Handoff, SnapshotCache, hand_off
-from lerobot_roborecover.scenario import Scenario, Start, default_rewind_steps
-from lerobot_roborecover.simulators import Simulator, SimulatorError, make_simulator
-from lerobot_roborecover.simulators.catalog import action_space
+from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator, platform_named
+from lerobot_roborecover.replay import Handoff, hand_off
+from lerobot_roborecover.rewind import Trail
+from lerobot_roborecover.scenario import Start, TrialStart
+from lerobot_roborecover.snapshots import SnapshotCache
+from lerobot_roborecover.workers.messages import RollbackResult
 
 
 class HandoffError(RuntimeError):
@@ -49,7 +49,7 @@ class RecoveryEnv(gym.Env):
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: TrialStart,
         start: str = "recovery",
         rewind_steps: int | None = None,
         *,
@@ -62,10 +62,12 @@ class RecoveryEnv(gym.Env):
         **options: Any,
     ):
         self.scenario = scenario
+        self._platform = platform_named(scenario.platform)
+        self._platform.check_scenario(scenario)
         self.render_mode = render_mode
         self._start = Start(start)
         if rewind_steps is None:
-            rewind_steps = default_rewind_steps(scenario.platform, scenario.task.horizon)
+            rewind_steps = self._platform.rewind_steps(scenario.task.horizon)
         self._rewind_steps = rewind_steps
         self._check = handoff_check
         self._owns_simulator = simulator is None
@@ -76,7 +78,7 @@ class RecoveryEnv(gym.Env):
         self._trail: Trail | None = None
         self.metadata = {**self.metadata, "render_fps": int(self._simulator.control_hz)}
         self.observation_space = self._simulator.observation_space
-        self.action_space = action_space(scenario.platform, self._simulator.action_dim)
+        self.action_space = self._platform.action_space(self._simulator.action_dim)
         self.handoff: Handoff | None = None
         self._steps = self._undone = 0
 
@@ -100,7 +102,7 @@ class RecoveryEnv(gym.Env):
         )
         self._trail = Trail(
             self._simulator,
-            self.scenario,
+            self.scenario.rollout,
             self.handoff.step,
             keep=self._rollback_steps,
             cache=self._cache,
@@ -150,7 +152,7 @@ class RecoveryEnv(gym.Env):
         trail = self._running()
         began = time.perf_counter()
         task = self.scenario.task
-        rewound = trail.back(default_rewind_steps(task.platform, task.horizon) if steps == BY_RULE else steps)
+        rewound = trail.back(self._platform.rewind_steps(task.horizon) if steps == BY_RULE else steps)
         self._undone += rewound.undone
         solved = self._simulator.succeeded()
         observation = self._simulator.observe()
@@ -174,32 +176,22 @@ class RecoveryEnv(gym.Env):
             self._simulator.close()
 
 
-def _on(platform: str, scenario: Scenario | None, kwargs: dict[str, Any]) -> RecoveryEnv:
+def make_env(platform: str, scenario: TrialStart | None = None, **kwargs: Any) -> RecoveryEnv:
+    """Entry point of `roborecover/<Platform>-v0`.
+
+    Args:
+        platform: the scenario's.
+        scenario: what to rebuild at every reset.
+        kwargs: of `RecoveryEnv`.
+
+    Raises:
+        ValueError: there is no scenario, or it is of another platform.
+    """
     if scenario is None:
         raise ValueError(
             f"give a scenario: gymnasium.make('roborecover/{platform.capitalize()}-v0', "
-            f"scenario=load_scenarios('{platform}_starter')[0])"
+            f"scenario=load_scenarios('{platform_named(platform).default_scenarios or 'DATASET'}')[0])"
         )
     if scenario.platform != platform:
         raise ValueError(f"scenario {scenario.id} is of platform {scenario.platform!r}, not {platform!r}")
     return RecoveryEnv(scenario, **kwargs)
-
-
-def make_libero(scenario: Scenario | None = None, **kwargs: Any) -> RecoveryEnv:
-    """Entry point of `roborecover/Libero-v0`."""
-    return _on("libero", scenario, kwargs)
-
-
-def make_metaworld(scenario: Scenario | None = None, **kwargs: Any) -> RecoveryEnv:
-    """Entry point of `roborecover/Metaworld-v0`."""
-    return _on("metaworld", scenario, kwargs)
-
-
-def make_robotwin(scenario: Scenario | None = None, **kwargs: Any) -> RecoveryEnv:
-    """Entry point of `roborecover/Robotwin-v0`."""
-    return _on("robotwin", scenario, kwargs)
-
-
-def make_fake(scenario: Scenario | None = None, **kwargs: Any) -> RecoveryEnv:
-    """Entry point of `roborecover/Fake-v0`."""
-    return _on("fake", scenario, kwargs)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gymnasium as gym
 
+from lerobot_roborecover.platforms import platform_names
+
 
 def register() -> None:
-    """Registers `roborecover/Libero-v0`, `roborecover/Metaworld-v0`, `roborecover/Robotwin-v0` and
-    `roborecover/Fake-v0`."""
-    for name in ("Libero", "Metaworld", "Robotwin", "Fake"):
+    """Registers `roborecover/<Platform>-v0` of every platform; none is imported."""
+    for name in platform_names():
         gym.register(
-            id=f"roborecover/{name}-v0",
-            entry_point=f"lerobot_roborecover.env.recovery_env:make_{name.lower()}",
+            id=f"roborecover/{name.capitalize()}-v0",
+            entry_point="lerobot_roborecover.env.recovery_env:make_env",
+            kwargs={"platform": name},
         )

@@ -1,4 +1,4 @@
-"""From options to `{group: {scenario id: vector env}}`: everything that can be refused is refused here,
+"""What all trials of a run share, and how it is opened: everything that can be refused is refused here,
 before a simulator starts.
 """
 
@@ -14,21 +14,29 @@ import numpy as np
 
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.datasets.load import validate_for
-from lerobot_roborecover.env.command_line import RunFacts, read_command_line
-from lerobot_roborecover.env.episode import SlotConfig
+from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
-from lerobot_roborecover.env.slots import SlotPool
+from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_log import Protocol, TrialLog, TrialRow
-from lerobot_roborecover.env.vector_env import Run, ScenarioVectorEnv
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.robot_fingerprint import (
+    NAME,
+    SAME,
+    RobotComparison,
+    compare_robots,
+    is_robot_entry,
+)
+from lerobot_roborecover.platforms.versions import installed, required, version_problems
 from lerobot_roborecover.scenario import Scenario, Start
-from lerobot_roborecover.versions import REQUIRED, installed, version_problems
+from lerobot_roborecover.workers.messages import SlotConfig
+from lerobot_roborecover.workers.slots import SlotPool
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RunSpec:
+class PlatformPart:
     """What an env type brings to a run, beside the common options."""
 
     slot: SlotConfig
@@ -41,8 +49,72 @@ class RunSpec:
     """Hashes of assets that decide the physics, under the names a fingerprint gives them."""
 
 
+@dataclass
+class Run:
+    """What all scenarios of a run share."""
+
+    pool: SlotPool
+    protocol: Protocol
+    log: TrialLog | None
+    dataset: str
+    dataset_revision: str | None
+    handoff_check: bool = True
+    n_trials: int | None = None
+    """Trials asked for per scenario; None where the caller did not say."""
+    picture: Callable[[dict], np.ndarray] | None = None
+    """Upright frame (H, W, 3) uint8 of an unbatched observation, for LeRobot's videos; None asks the
+    simulator."""
+    intervention: InterventionFacts | None = None
+    """Of a composite policy."""
+
+    def action_width(self, scenario: Scenario) -> int:
+        """Values in a policy's action, which need not be those of the scenario's prefix."""
+        options = self.pool.config.options if self.pool is not None else {}
+        return platform_named(scenario.platform).policy_action_width(options, scenario.prefix.shape[1])
+
+    def rollback_steps(self, scenario: Scenario) -> int:
+        """How far back the policy may ask to go."""
+        return self.intervention.rollback_steps(scenario) if self.intervention else 0
+
+    def rows(self) -> list[TrialRow]:
+        """The log's rows of this run's protocol."""
+        config_hash = self.protocol.config_hash()
+        return [] if self.log is None else [r for r in self.log.rows if r.config_hash == config_hash]
+
+    def trial(self, scenario: Scenario, index: int, protocol: Protocol | None = None) -> Trial:
+        """A trial of the run, not begun.
+
+        Args:
+            scenario: one of the run's.
+            index: k.
+            protocol: in place of the run's own, for a loop that learns its seed late.
+        """
+        return Trial(
+            scenario,
+            index,
+            protocol or self.protocol,
+            action_width=self.action_width(scenario),
+            handoff_check=self.handoff_check,
+            rollback_steps=self.rollback_steps(scenario),
+        )
+
+    def record(self, trial: Trial, *, noise: str, batch_size: int) -> TrialRow:
+        """The row of a trial that is over, on disk before this returns; arguments as `Trial.row`."""
+        row = trial.row(
+            dataset=self.dataset, dataset_revision=self.dataset_revision, noise=noise, batch_size=batch_size
+        )
+        if self.log is not None:
+            self.log.append(row)
+        return row
+
+
 def open_run(
-    options: RecoveryOptions, spec: RunSpec, *, workers: bool, facts: RunFacts | None = None
+    options: RecoveryOptions,
+    spec: PlatformPart,
+    *,
+    workers: bool,
+    facts: RunFacts | None = None,
+    scenarios: ScenarioSet | None = None,
 ) -> tuple[ScenarioSet, Run]:
     """Checks everything, loads the scenarios and opens the trial log; no simulator starts yet.
 
@@ -50,7 +122,8 @@ def open_run(
         options: the env type's options.
         spec: what the env type adds.
         workers: simulators in processes of their own, or in this one.
-        facts: what the command line says; by default read from it.
+        facts: who is evaluated, and how much of it.
+        scenarios: what to run in place of those that the options name.
 
     Raises:
         OptionError: an option, or the batch size, cannot be used.
@@ -58,10 +131,10 @@ def open_run(
         TrialLogError: the trial log is damaged or in use.
     """
     options.check()
-    facts = facts or read_command_line()
+    facts = facts or RunFacts()
     _check_batch(facts)
     platform = spec.slot.platform
-    scenarios = _load(options, platform)
+    scenarios = _of_this_run(_load(options, platform) if scenarios is None else scenarios, options, platform)
     _check_versions(scenarios, platform, spec.assets, options.strict_versions)
     start = Start(options.start)
     decisive = {**spec.decisive, "handoff_check": options.handoff_check}
@@ -77,7 +150,7 @@ def open_run(
         run_seed=None,
         execution_horizon=facts.execution_horizon,
         options=decisive,
-        versions={name: installed(name) or "" for name in REQUIRED[platform]},
+        versions={name: installed(name) or "" for name in required(platform)},
     )
     log = TrialLog(options.trial_log_path(facts.output_dir))
     trials = "" if facts.n_episodes is None else f", {facts.n_episodes} trials each"
@@ -109,37 +182,17 @@ def open_run(
     return scenarios, run
 
 
-def create_recovery_envs(
-    options: RecoveryOptions, spec: RunSpec, *, n_envs: int, workers: bool, facts: RunFacts | None = None
-) -> dict[str, dict[str, ScenarioVectorEnv]]:
-    """Builds what `lerobot-eval` iterates over: `{group: {scenario id: vector env}}`, tasks kept together.
-
-    Args:
-        options: the env type's options.
-        spec: what the env type adds.
-        n_envs: trials in a batch.
-        workers: simulators in processes of their own, or in this one.
-        facts: what the command line says; by default read from it.
-
-    Raises:
-        OptionError, ScenarioError, TrialLogError: see `open_run`.
-    """
-    scenarios, run = open_run(options, spec, workers=workers, facts=facts)
-    envs: dict[str, dict[str, ScenarioVectorEnv]] = {}
-    for scenario in sorted(scenarios, key=lambda s: (s.task.suite, s.task.name, s.id)):
-        envs.setdefault(_group(scenario, options.group_by), {})[scenario.id] = ScenarioVectorEnv(
-            scenario, n_envs, run
-        )
-    return envs
-
-
 def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:
-    scenarios = load_scenarios(
-        options.scenarios or f"{platform}_starter",
+    return load_scenarios(
+        options.scenarios or _default_scenarios(platform),
         revision=options.revision,
         split=options.split,
         select=options.select,
     )
+
+
+def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str) -> ScenarioSet:
+    """The shard's part, without pictures."""
     validate_for(scenarios, platform)
     k, n = options.shard_of()
     part = scenarios.shard(k, n)
@@ -149,6 +202,15 @@ def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:
             f"Use at most {len(scenarios)}"
         )
     return replace(part, scenarios=tuple(map(_without_pictures, part)))
+
+
+def _default_scenarios(platform: str) -> str:
+    found = platform_named(platform).default_scenarios
+    if not found:
+        raise OptionError(
+            f"--env.scenarios: {platform} has no shipped scenarios; name a folder or a dataset of the Hub"
+        )
+    return found
 
 
 def _without_pictures(scenario: Scenario) -> Scenario:
@@ -173,7 +235,8 @@ def group_name(row: TrialRow, by: str) -> str:
     return row.source if by == "source" else row.suite
 
 
-def _group(scenario: Scenario, by: str) -> str:
+def scenario_group(scenario: Scenario, by: str) -> str:
+    """Name of the group that a scenario's trials will be in."""
     if by == "cell":
         return _cell_name(scenario.stage, scenario.deviation)
     return scenario.source.value if by == "source" else scenario.task.suite
@@ -194,10 +257,12 @@ def _check_batch(facts: RunFacts) -> None:
     and a batch for a policy that keeps the history of one environment."""
     if facts.policy_type in _ONE_ENVIRONMENT and facts.batch_size not in (None, 1) and facts.n_episodes != 1:
         raise OptionError(
-            f"--eval.batch_size={facts.batch_size or 'auto'}: LeRobot's {facts.policy_type} keeps the "
+            f"--eval.batch_size={facts.batch_size}: LeRobot's {facts.policy_type} keeps the "
             "history of one environment. Use --eval.batch_size=1, or roborecover eval, which gives every "
             "slot an instance that shares the weights"
         )
+    if facts.lerobots_batch:
+        return  # nobody asked for it, and the trials beyond the number cost no simulator
     if facts.n_episodes and facts.batch_size and facts.n_episodes % facts.batch_size:
         divisors = [d for d in range(1, facts.n_episodes + 1) if facts.n_episodes % d == 0]
         if facts.batch_size > facts.n_episodes:
@@ -206,6 +271,35 @@ def _check_batch(facts: RunFacts) -> None:
             f"--eval.batch_size={facts.batch_size} does not divide --eval.n_episodes={facts.n_episodes}. "
             f"Use one of {divisors}"
         )
+
+
+def _robot_problems(scenarios: ScenarioSet, assets: Mapping[str, str]) -> list[str]:
+    """One sentence for each other robot that scenarios were recorded on; lesser differences are logged."""
+    if not any(is_robot_entry(name) for name in assets):
+        return []
+    found: dict[RobotComparison, list[str]] = {}
+    for scenario in scenarios:
+        if scenario.fingerprint is not None:
+            robots = compare_robots(scenario.fingerprint.versions, assets)
+            if robots != SAME:
+                found.setdefault(robots, []).append(scenario.id)
+    name, problems = assets.get(NAME, "robot"), []
+    for robots, ids in found.items():
+        others = f" (and {len(ids) - 1} more)" if len(ids) > 1 else ""
+        if not robots.known:
+            logger.warning(
+                "scenario %s%s does not say which robot recorded it; if that was another one, its handoff "
+                "ends as state_mismatch. Record it again to have the robots compared",
+                ids[0],
+                others,
+            )
+            continue
+        text = f"scenario {ids[0]}{others} was recorded on another robot than the {name} here: {robots}"
+        if robots.another:
+            problems.append(text + ". Put the platform's own robot in place (roborecover doctor)")
+        else:
+            logger.warning("%s; its arms reach the same places, and the check of every handoff decides", text)
+    return problems
 
 
 def _check_versions(scenarios: ScenarioSet, platform: str, assets: Mapping[str, str], strict: bool) -> None:
@@ -217,7 +311,10 @@ def _check_versions(scenarios: ScenarioSet, platform: str, assets: Mapping[str, 
         if scenario.fingerprint is not None:
             for item in scenario.fingerprint.versions.items():
                 recorded.setdefault(item, scenario.id)
+    problems += _robot_problems(scenarios, assets)
     for (name, version), scenario_id in sorted(recorded.items()):
+        if is_robot_entry(name):
+            continue
         if assets.get(name, version) != version:
             # A warning: the 2 mm check of every handoff decides whether the difference matters.
             logger.warning(

@@ -3,7 +3,6 @@ it."""
 
 from __future__ import annotations
 
-import importlib
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,17 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.env.episode import ActResult, EpisodeSpec, EpisodeStart, SlotConfig, StepResult
 from lerobot_roborecover.env.recovery_env import RecoveryEnv
-from lerobot_roborecover.replay import SnapshotCache
-from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.simulators import make_simulator
-
-
-def make_server(config: SlotConfig) -> SlotServer:
-    """The server that a configuration names."""
-    module, _, name = config.server.partition(":")
-    return getattr(importlib.import_module(module), name)(config)
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.scenario import TrialStart
+from lerobot_roborecover.snapshots import SnapshotCache
+from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotConfig, StepResult
 
 
 class SlotServer:
@@ -83,7 +76,7 @@ class SlotServer:
         frame = self._env.render() if spec.filmed else None
         return EpisodeStart(observation, self._env.handoff, frame, self._simulator.control_hz)
 
-    def _smoke(self, scenario: Scenario) -> np.ndarray | None:
+    def _smoke(self, scenario: TrialStart) -> np.ndarray | None:
         """A picture of the scenario's first state; None where that state cannot be had, which is a trial's
         own affair."""
         try:

@@ -7,24 +7,34 @@ choice.
 
 from __future__ import annotations
 
-import fcntl
+import gc
 import hashlib
 import json
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lerobot_roborecover.env.trial_check import (
+    MAX_LINE_BYTES,
+    MAX_TEXT,
+    TRIAL_SCHEMA,
+    FieldProblem,
+    RowChecker,
+    parse_json,
+)
+from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.journal import AppendOnly, InUseError, complete_lines
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.replay import Handoff
-from lerobot_roborecover.scenario import Outcome, Scenario, default_rewind_steps
-
-TRIAL_SCHEMA = 1
+from lerobot_roborecover.scenario import Outcome, TrialStart
 
 
-class TrialLogError(ValueError):
+class TrialLogError(RoboRecoverError, ValueError):
     """A trial log cannot be used; the message says where, why and the remedy."""
 
 
@@ -48,10 +58,10 @@ class Protocol:
     versions: Mapping[str, str] = field(default_factory=dict)
     """Packages that decide scores."""
 
-    def rewind_for(self, scenario: Scenario) -> int:
+    def rewind_for(self, scenario: TrialStart) -> int:
         """Steps before the recovery point on this scenario, before the task's start limits them."""
         if self.rewind_steps is None:
-            return default_rewind_steps(scenario.platform, scenario.task.horizon)
+            return platform_named(scenario.platform).rewind_steps(scenario.task.horizon)
         return self.rewind_steps
 
     def config_hash(self) -> str:
@@ -59,9 +69,12 @@ class Protocol:
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One finished trial. Flat, so that a log loads into any table library as it is."""
+    """One finished trial. Flat, so that a log loads into any table library as it is.
+
+    Rows of one log share equal texts, `options` and `versions`; nobody changes these in place.
+    """
 
     schema: int
     """Version of this layout."""
@@ -143,7 +156,7 @@ def trial_seed(run_seed: int | None, scenario_id: str, trial: int) -> int | None
 
 
 def make_row(
-    scenario: Scenario,
+    scenario: TrialStart,
     protocol: Protocol,
     *,
     dataset: str,
@@ -161,22 +174,23 @@ def make_row(
     interventions: Iterable = (),
 ) -> TrialRow:
     """The one place where a trial row is built."""
+    labels = scenario.labels
     return TrialRow(
         schema=TRIAL_SCHEMA,
         scenario_id=scenario.id,
         scenario_sha256=scenario.sha256(),
-        dataset=dataset,
+        dataset=_writable(dataset),
         dataset_revision=dataset_revision,
         platform=scenario.platform,
         suite=scenario.task.suite,
         task=scenario.task.name,
         instruction=scenario.task.instruction,
-        stage=scenario.stage.value,
-        deviation=scenario.deviation.value,
-        source=scenario.source.value,
-        source_policy=scenario.source_policy,
-        cluster=scenario.cluster,
-        split=scenario.split,
+        stage=labels.stage,
+        deviation=labels.deviation,
+        source=labels.source,
+        source_policy=labels.source_policy,
+        cluster=labels.cluster,
+        split=labels.split,
         start=protocol.start,
         rewind_steps=protocol.rewind_for(scenario),
         handoff_step=handoff.step if handoff else 0,
@@ -187,7 +201,8 @@ def make_row(
         batch_size=batch_size,
         outcome=outcome.value,
         success=outcome is Outcome.SUCCESS,
-        reason=reason,
+        # What broke a trial may have said anything, and must not make its row one that nobody can read.
+        reason=reason[:MAX_TEXT].encode(errors="replace").decode(),
         steps=steps,
         horizon=scenario.task.horizon,
         handoff_eef_error_mm=handoff.eef_error_mm if handoff else None,
@@ -199,7 +214,7 @@ def make_row(
         policy_s=round(policy_s, 4),
         actions_sha256=actions_sha256,
         interventions=list(interventions),
-        policy=protocol.policy,
+        policy=_writable(protocol.policy),
         execution_horizon=protocol.execution_horizon,
         options=dict(protocol.options),
         versions=dict(protocol.versions),
@@ -208,68 +223,123 @@ def make_row(
     )
 
 
-def parse_rows(text: str, where: str) -> list[TrialRow]:
-    """Rows of a log's text; a last line without its newline is a crash's leftover and is left out.
+def _writable(name: str) -> str:
+    """A name as a log takes it: what a path or an error message holds beyond printable text is replaced."""
+    return name if name.isprintable() else "".join(c if c.isprintable() else "\ufffd" for c in name)
+
+
+@dataclass(frozen=True)
+class ReadLog:
+    """A log as it was read."""
+
+    path: Path
+    rows: tuple[TrialRow, ...]
+    """One of each trial."""
+    lines: tuple[int, ...]
+    """Where each row stands, from 1."""
+    policies: tuple[str, ...]
+    """Whose rows these are, in the log's own words."""
+    cut: bool
+    """Whether the last line lacks its end, as after a crash; it is left out of the rows."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What whoever uses the rows has to know about the file."""
+        if not self.cut:
+            return ()
+        return (f"{self.path}: its last line was cut off by a crash and is left out; rerun to complete",)
+
+
+_SETTERS = tuple((f.name, getattr(TrialRow, f.name).__set__) for f in fields(TrialRow))
+
+
+def _row_of(record: Mapping[str, Any]) -> TrialRow:
+    """A row of checked fields; a frozen dataclass's own `__init__` takes eight times as long."""
+    row = object.__new__(TrialRow)
+    for name, put in _SETTERS:
+        put(row, record[name])
+    return row
+
+
+def _checked_rows(lines: Iterable[bytes], where: str) -> Iterator[tuple[int, TrialRow]]:
+    """The rows of complete lines and their line numbers, one row of each trial.
 
     Raises:
-        TrialLogError: a complete line is not a trial row, or two rows disagree about one trial.
+        TrialLogError: a line is not a trial row, or two rows disagree about one trial.
     """
-    return list(_checked_rows(text.split("\n")[:-1], where))
-
-
-def _checked_rows(lines: Iterable[str], where: str) -> Iterator[TrialRow]:
-    """The rows of complete lines, one of each trial; errors are those of `parse_rows`."""
-    ended: dict[tuple, tuple[str, int]] = {}
-    names = {f.name for f in fields(TrialRow)}
+    ended: dict[tuple, tuple[int, str, int]] = {}
+    checker = RowChecker()
     for number, line in enumerate(lines, 1):
         try:
-            record = json.loads(line)
-        except ValueError as err:
+            if len(line) > MAX_LINE_BYTES:
+                raise FieldProblem(
+                    f"longer than {MAX_LINE_BYTES} bytes; this is not a trial log. Name another"
+                )
+            row = _row_of(checker.check(parse_json(line)))
+        except FieldProblem as err:
+            raise TrialLogError(f"{where}, line {number}: {err}") from None
+        key = row.key()
+        before = ended.setdefault(key, (number, row.outcome, row.steps))
+        if before[1:] != (row.outcome, row.steps):
             raise TrialLogError(
-                f"{where}, line {number}: not a JSON trial row ({err}). Only a last line can be cut "
-                "off by a crash; "
-                "this one is damaged. Remove the line to run its trial again"
-            ) from None
-        version = record.get("schema") if isinstance(record, dict) else None
-        if not isinstance(version, int) or version < 1 or version > TRIAL_SCHEMA:
-            raise TrialLogError(
-                f"{where}, line {number}: trial schema {version!r}; this version reads 1 to {TRIAL_SCHEMA}. "
-                "Upgrade lerobot_env_roborecover, or use another file"
+                f"{where}, line {number}: field 'outcome': trial {row.trial} of {row.scenario_id} ended as "
+                f"{row.outcome!r} after {row.steps} steps here and as {before[1]!r} after {before[2]} "
+                f"before, in line {before[0]}. One of the two is wrong; keep the logs apart"
             )
-        if set(record) != names:
-            odd = sorted(set(record) ^ names)
-            raise TrialLogError(f"{where}, line {number}: field {odd[0]!r} is missing or not known")
-        row = TrialRow(**record)
-        key = _shared(row.key())
-        first = key not in ended
-        outcome, steps = ended.setdefault(key, (row.outcome, row.steps))
-        if (outcome, steps) != (row.outcome, row.steps):
-            raise TrialLogError(
-                f"{where}, line {number}: trial {row.trial} of {row.scenario_id} ended as "
-                f"{row.outcome!r} after "
-                f"{row.steps} steps here and as {outcome!r} after {steps} before. One "
-                "of the two is "
-                "wrong; keep the logs apart"
-            )
-        if first:
-            yield row
+        if before[0] == number:
+            yield number, row
 
 
-def _shared(key: tuple) -> tuple:
-    """An equal key: the same few hashes and ids come with every row, and one copy of each is kept."""
-    return tuple(sys.intern(part) if isinstance(part, str) else part for part in key)
+def read_log(path: Path, policy: str | None = None) -> ReadLog:
+    """A log on disk: its complete rows, where they stand, and whether its last line was cut off.
+
+    Args:
+        path: the file.
+        policy: name that takes the place of the rows' own.
+
+    Raises:
+        TrialLogError: the file cannot be read as a trial log; names the line and the field.
+    """
+    try:
+        with open(path, "rb") as file, _collector_paused():
+            policies: dict[str, None] = {}
+            lines: list[int] = []
+            rows: list[TrialRow] = []
+            for line, row in _checked_rows(complete_lines(file, MAX_LINE_BYTES), str(path)):
+                policies[row.policy] = None
+                if policy is not None:
+                    object.__setattr__(row, "policy", policy)  # nobody has seen the row yet
+                lines.append(line)
+                rows.append(row)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 1, 0))
+            cut = file.read(1) not in (b"\n", b"")
+    except (OSError, ValueError) as err:  # ValueError: a path with a NUL
+        if isinstance(err, TrialLogError):
+            raise
+        raise TrialLogError(f"cannot read trial log {path}: {err}") from None
+    return ReadLog(Path(path), tuple(rows), tuple(lines), tuple(policies), cut)
+
+
+@contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Rows hold no cycles; to look for some again and again takes a third of a long log's time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def read_trial_log(path: Path) -> list[TrialRow]:
     """All complete rows of a log on disk.
 
     Raises:
-        TrialLogError: the file cannot be read as a trial log.
+        TrialLogError: the file cannot be read as a trial log; names the line and the field.
     """
-    try:
-        return parse_rows(Path(path).read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as err:
-        raise TrialLogError(f"cannot read trial log {path}: {err}") from None
+    return list(read_log(path).rows)
 
 
 class Finished(NamedTuple):
@@ -293,12 +363,9 @@ class TrialLog:
 
     def __init__(self, path: Path):
         self.path = Path(path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(self.path, "a+b")  # noqa: SIM115 - lives as long as the log
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._file.close()
+            self._file = AppendOnly(self.path)
+        except InUseError:
             raise TrialLogError(
                 f"trial log {path} is in use by another process. Wait for it, or give this run a "
                 "log of its own "
@@ -306,31 +373,12 @@ class TrialLog:
             ) from None
         self._done: dict[tuple, Finished] = {}
         try:
-            complete = self._read()
-        except (TrialLogError, UnicodeDecodeError) as err:
+            for _, row in _checked_rows(self._file.lines(MAX_LINE_BYTES), str(self.path)):
+                self._remember(row)
+        except TrialLogError:
             self._file.close()
-            if isinstance(err, TrialLogError):
-                raise
-            raise TrialLogError(f"{path}: not UTF-8 text ({err}); this is not a trial log") from None
-        self.dropped_bytes = self._file.seek(0, os.SEEK_END) - complete
-        if self.dropped_bytes:
-            self._file.truncate(complete)
-
-    def _read(self) -> int:
-        """Takes the complete lines in; returns where they end."""
-        complete = 0
-
-        def lines() -> Iterator[str]:
-            nonlocal complete
-            self._file.seek(0)
-            for line in self._file:
-                if line.endswith(b"\n"):
-                    complete += len(line)
-                    yield line.decode("utf-8")
-
-        for row in _checked_rows(lines(), str(self.path)):
-            self._remember(row)
-        return complete
+            raise
+        self.dropped_bytes = self._file.cut()
 
     def __len__(self) -> int:
         return len(self._done)
@@ -348,13 +396,13 @@ class TrialLog:
         """Writes a row and waits until it is on disk."""
         if row.key() in self._done:
             raise TrialLogError(f"trial {row.trial} of {row.scenario_id} is already in {self.path}")
-        self._file.write(json.dumps(asdict(row), allow_nan=False).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        self._file.append(json.dumps(asdict(row), allow_nan=False).encode())
         self._remember(row)
 
     def _remember(self, row: TrialRow) -> None:
-        self._done[_shared(row.key())] = Finished(row.success, row.steps)
+        self._done[tuple(sys.intern(p) if isinstance(p, str) else p for p in row.key())] = Finished(
+            row.success, row.steps
+        )
 
     def close(self) -> None:
         """Releases the file."""

@@ -15,11 +15,9 @@ action on a blank observation, because its loop has no way not to; the action is
 
 from __future__ import annotations
 
-import hashlib
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -27,74 +25,15 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from lerobot_roborecover.env.directives import split
-from lerobot_roborecover.env.episode import EpisodeSpec, EpisodeStart, RollbackResult, SlotFailure, StepResult
-from lerobot_roborecover.env.intervention_options import InterventionFacts
-from lerobot_roborecover.env.intervention_record import InterventionRecord
-from lerobot_roborecover.env.slots import SlotPool
-from lerobot_roborecover.env.trial_log import (
-    Protocol,
-    TrialLog,
-    TrialRow,
-    make_row,
-    trial_key,
-    trial_seed,
-)
-from lerobot_roborecover.replay import Handoff
-from lerobot_roborecover.scenario import Outcome, Scenario
-from lerobot_roborecover.simulators.catalog import action_space
+from lerobot_roborecover.env.facts import RunFacts
+from lerobot_roborecover.env.options import RecoveryOptions
+from lerobot_roborecover.env.run import PlatformPart, Run, open_run, scenario_group
+from lerobot_roborecover.env.trial import Act, Trial, TrialState
+from lerobot_roborecover.env.trial_log import Protocol, trial_seed
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.scenario import Scenario
 
 _FALLBACK_FRAME = (64, 64, 3)
-SOLVED_THERE = "the task's predicate already holds where the rollback went"
-FAILURES = {"raised": Outcome.SIM_ERROR, "died": Outcome.SIM_ERROR, "hung": Outcome.TIMEOUT}
-
-
-@dataclass
-class Run:
-    """What all scenarios of a run share."""
-
-    pool: SlotPool
-    protocol: Protocol
-    log: TrialLog | None
-    dataset: str
-    dataset_revision: str | None
-    handoff_check: bool = True
-    n_trials: int | None = None
-    """Trials asked for per scenario; None where the caller did not say."""
-    picture: Callable[[dict], np.ndarray] | None = None
-    """Upright frame (H, W, 3) uint8 of an unbatched observation, for LeRobot's videos; None asks the
-    simulator."""
-    intervention: InterventionFacts | None = None
-    """Of a composite policy."""
-
-    def action_width(self, scenario: Scenario) -> int:
-        """Values in a policy's action. RoboTwin takes joint targets and end-effector poses: what a policy
-        gives is the run's option, whatever the scenario's prefix was recorded in."""
-        if scenario.platform != "robotwin":
-            return scenario.prefix.shape[1]
-        from lerobot_roborecover.simulators.robotwin import ACTION_MODES
-
-        return ACTION_MODES[self.pool.config.options.get("action_mode", "joint")]
-
-    def rollback_steps(self, scenario: Scenario) -> int:
-        """How far back the policy may ask to go."""
-        return self.intervention.rollback_steps(scenario) if self.intervention else 0
-
-
-@dataclass
-class _Trial:
-    """One slot's current trial."""
-
-    index: int
-    observation: dict | None = None
-    handoff: Handoff | None = None
-    steps: int = 0
-    done: bool = False
-    success: bool = False
-    sim_s: float = 0.0
-    policy_s: float = 0.0
-    frame: np.ndarray | None = None
-    actions: Any = field(default_factory=hashlib.sha256)
-    record: InterventionRecord = field(default_factory=InterventionRecord)
 
 
 class ScenarioVectorEnv(gym.vector.VectorEnv):
@@ -117,7 +56,9 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         self.run = run
         self.render_mode = "rgb_array"
         self.metadata = {**self.metadata, "render_fps": 20}
-        self._trials: list[_Trial] = []
+        self._trials: list[Trial] = []
+        self._frames: list[np.ndarray | None] = []
+        """Picture of each trial's present state, once one was asked for."""
         self._next_trial = 0
         self._blank: dict | None = None
         self._protocol = run.protocol
@@ -138,7 +79,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
     @property
     def single_action_space(self) -> gym.spaces.Box:
         """One trial's action."""
-        return action_space(self.scenario.platform, self.run.action_width(self.scenario))
+        return platform_named(self.scenario.platform).action_space(self.run.action_width(self.scenario))
 
     @property
     def action_space(self) -> gym.Space:
@@ -157,29 +98,20 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         first = self._next_trial
         self._next_trial += self.num_envs
         self._protocol = self._with_run_seed(seed, first)
-        self._trials = [_Trial(first + i) for i in range(self.num_envs)]
+        self._trials = [
+            self.run.trial(self.scenario, first + i, self._protocol) for i in range(self.num_envs)
+        ]
+        self._frames = [None] * self.num_envs
         self.metadata["render_fps"] = int(self.run.pool.spaces()["hz"])
         slots = self.run.pool.slots(self.num_envs)
-        rewind_steps = self._protocol.rewind_for(self.scenario)
-        spec = EpisodeSpec(
-            self.scenario,
-            self._protocol.start,
-            rewind_steps,
-            self.run.handoff_check,
-            rollback_steps=self.run.rollback_steps(self.scenario),
-        )
-        running = [(t, s) for t, s in zip(self._trials, slots, strict=True) if not self._already_done(t)]
-        for _, slot in running:
-            slot.send("reset", spec)
-        for trial, slot in running:
-            reply = slot.receive()
-            if isinstance(reply, SlotFailure):
-                self._finish(trial, FAILURES[reply.kind], f"at the handoff: {reply.message}")
-                continue
-            assert isinstance(reply, EpisodeStart)
-            trial.observation, trial.handoff = reply.observation, reply.handoff
-            if reply.handoff.problem is not None:
-                self._finish(trial, reply.handoff.problem, reply.handoff.reason)
+        for trial in self._trials:
+            self._skip_what_is_done(trial)
+        begun = [(t, s) for t, s in zip(self._trials, slots, strict=True) if not t.over]
+        for trial, slot in begun:
+            slot.send("reset", trial.begin())
+        for trial, slot in begun:
+            trial.take(slot.receive())
+            self._record_if_over(trial)
         self._seed_policy_noise(first)
         self._replied = time.perf_counter()
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
@@ -192,51 +124,26 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         """
         waited = time.perf_counter() - self._replied
         slots = self.run.pool.slots(self.num_envs)
-        before = np.array([t.done for t in self._trials])
-        running = []
+        before = np.array([t.over for t in self._trials])
         actions, directives = split(np.asarray(actions), self.run.action_width(self.scenario))
-        directives = directives or [None] * self.num_envs
-        for trial, slot, action, directive in zip(self._trials, slots, actions, directives, strict=True):
-            if trial.done:
+        working = []
+        for index, trial in enumerate(self._trials):
+            if trial.over:
                 continue
-            trial.policy_s += waited
-            if directive is not None:
-                trial.record.note(directive, trial.steps)
-                if directive.rollback:
-                    slot.send("rollback", directive.rollback)
-                    running.append((trial, slot, directive))
-                    continue
-            problem = action_problem(self.scenario, action, self.run.action_width(self.scenario))
-            if problem:
-                self._finish(trial, Outcome.POLICY_ERROR, problem)
+            own = directives and directives[index : index + 1]
+            move = trial.decide(actions[index : index + 1], own, seconds=waited)
+            if move is None:
+                self._record_if_over(trial)
                 continue
-            trial.actions.update(np.ascontiguousarray(action).tobytes())
-            slot.send("step", action)
-            running.append((trial, slot, directive))
-        for trial, slot, directive in running:
-            reply = slot.receive()
-            if isinstance(reply, SlotFailure):
-                self._finish(trial, FAILURES[reply.kind], f"at step {trial.steps}: {reply.message}")
-                continue
-            trial.observation, trial.frame = reply.observation, None
-            if isinstance(reply, RollbackResult):
-                trial.record.rolled_back(directive.rollback, reply)
-                trial.sim_s += reply.seconds
-                if reply.solved:
-                    self._finish(trial, Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
-                continue
-            assert isinstance(reply, StepResult)
-            trial.steps += 1
-            trial.sim_s += reply.seconds
-            if directive is not None:
-                trial.record.acted(directive)
-            if reply.success:
-                trial.record.solved()
-            if reply.success or trial.steps >= trial.record.budget(self.scenario.task.horizon):
-                outcome, trial.steps = trial.record.verdict(trial.steps, self.scenario.task.horizon)
-                self._finish(trial, outcome)
+            command = ("step", move.actions[0]) if isinstance(move, Act) else ("rollback", move.steps)
+            slots[index].send(*command)
+            working.append(index)
+        for index in working:
+            self._trials[index].take(slots[index].receive())
+            self._frames[index] = None
+            self._record_if_over(self._trials[index])
         success = np.array([t.success for t in self._trials])
-        done = np.array([t.done for t in self._trials])
+        done = np.array([t.over for t in self._trials])
         reward = np.where(before, 0.0, success.astype(np.float64))
         self._replied = time.perf_counter()
         return self._observation(), reward, done & success, done & ~success, {"is_success": success}
@@ -277,17 +184,12 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         start = seed if isinstance(seed, int) else seed[0]
         return replace(self.run.protocol, run_seed=int(start) - first)
 
-    def _already_done(self, trial: _Trial) -> bool:
-        """Settles a trial that needs no simulator: surplus to the request, or finished in an earlier run."""
+    def _skip_what_is_done(self, trial: Trial) -> None:
+        """Ends a trial that needs no simulator: surplus to the request, or finished in an earlier run."""
         if self.run.n_trials is not None and trial.index >= self.run.n_trials:
-            trial.done = True
-        elif self.run.log is not None:
-            row = self.run.log.find(
-                trial_key(self.scenario.sha256(), self.scenario.id, self._protocol.config_hash(), trial.index)
-            )
-            if row is not None:
-                trial.done, trial.success, trial.steps = True, row.success, row.steps
-        return trial.done
+            trial.skip()
+        elif self.run.log is not None and (found := self.run.log.find(trial.key)) is not None:
+            trial.skip(success=found.success, steps=found.steps)
 
     def _seed_policy_noise(self, first: int) -> None:
         """Sets torch's global generator, which stock policies draw their noise from.
@@ -300,69 +202,39 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         if torch is not None and seed is not None:
             torch.manual_seed(seed)
 
-    def _finish(self, trial: _Trial, outcome: Outcome, reason: str = "") -> None:
-        trial.done, trial.success = True, outcome is Outcome.SUCCESS
-        row = self._row(trial, outcome, reason)
-        if self.run.log is not None:
-            self.run.log.append(row)
-        if not outcome.valid:
-            print(f"{self.scenario.id} trial {trial.index}: {outcome.value}: {reason}", file=sys.stderr)
-
-    def _row(self, trial: _Trial, outcome: Outcome, reason: str) -> TrialRow:
-        return make_row(
-            self.scenario,
-            self._protocol,
-            dataset=self.run.dataset,
-            dataset_revision=self.run.dataset_revision,
-            trial=trial.index,
-            noise="unseeded"
-            if self._protocol.run_seed is None
-            else "per_trial"
-            if self.num_envs == 1
-            else "per_batch",
-            batch_size=self.num_envs,
-            outcome=outcome,
-            reason=reason,
-            steps=trial.steps,
-            handoff=trial.handoff,
-            sim_s=trial.sim_s,
-            policy_s=trial.policy_s,
-            actions_sha256=trial.actions.hexdigest(),
-            interventions=trial.record.entries(),
-        )
+    def _record_if_over(self, trial: Trial) -> None:
+        if trial.outcome is None:
+            return
+        alone = "per_trial" if self.num_envs == 1 else "per_batch"
+        noise = "unseeded" if self._protocol.run_seed is None else alone
+        self.run.record(trial, noise=noise, batch_size=self.num_envs)
+        if not trial.outcome.valid:
+            text = f"{self.scenario.id} trial {trial.index}: {trial.outcome.value}: {trial.reason}"
+            print(text, file=sys.stderr)
 
     def _observation(self) -> dict:
+        """The batch that LeRobot asks the policy about next; a trial that is over repeats its last one."""
         if self._blank is None:
             self._blank = _zeros(self.single_observation_space)
-        return _stack([t.observation if t.observation is not None else self._blank for t in self._trials])
+        shown = [t.ask() if t.state is TrialState.WAITING else t.observation for t in self._trials]
+        return _stack([self._blank if o is None else o for o in shown])
 
     def _picture(self, index: int) -> np.ndarray:
         """A trial's frame for LeRobot's videos; black where the trial has none."""
-        trial = self._trials[index]
-        if trial.frame is None and trial.observation is not None:
+        observation, frame = self._trials[index].observation, self._frames[index]
+        if frame is None and observation is not None:
             if self.run.picture is not None:
-                trial.frame = self.run.picture(trial.observation)
+                frame = self.run.picture(observation)
             else:
                 slot = self.run.pool.slots(self.num_envs)[index]
                 slot.send("render")
                 reply = slot.receive()
-                trial.frame = reply if isinstance(reply, np.ndarray) else None
-        if trial.frame is not None:
-            self._frame_shape = trial.frame.shape
-            return trial.frame
+                frame = reply if isinstance(reply, np.ndarray) else None
+            self._frames[index] = frame
+        if frame is not None:
+            self._frame_shape = frame.shape
+            return frame
         return np.zeros(self._frame_shape, np.uint8)
-
-
-def action_problem(scenario: Scenario, action: np.ndarray, width: int) -> str:
-    """Why an action cannot be sent to the scenario's simulator, in words; empty if it can."""
-    if action.shape != (width,):
-        return (
-            f"the policy gave an action of shape {action.shape}; platform {scenario.platform} takes "
-            f"({width},). Check that the checkpoint was trained for this platform"
-        )
-    if not np.isfinite(action).all():
-        return f"the policy gave a non-finite action {action.tolist()}; it was not sent to the simulator"
-    return ""
 
 
 def _zeros(space: gym.Space) -> Any:
@@ -376,3 +248,27 @@ def _stack(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: _stack([o[key] for o in observations]) for key in observations[0]}
     return np.stack(observations)
+
+
+def create_recovery_envs(
+    options: RecoveryOptions, spec: PlatformPart, *, n_envs: int, workers: bool, facts: RunFacts | None = None
+) -> dict[str, dict[str, ScenarioVectorEnv]]:
+    """Builds what `lerobot-eval` iterates over: `{group: {scenario id: vector env}}`, tasks kept together.
+
+    Args:
+        options: the env type's options.
+        spec: what the env type adds.
+        n_envs: trials in a batch.
+        workers: simulators in processes of their own, or in this one.
+        facts: who is evaluated, and how much of it.
+
+    Raises:
+        OptionError, ScenarioError, TrialLogError: see `open_run`.
+    """
+    scenarios, run = open_run(options, spec, workers=workers, facts=facts)
+    envs: dict[str, dict[str, ScenarioVectorEnv]] = {}
+    for scenario in sorted(scenarios, key=lambda s: (s.task.suite, s.task.name, s.id)):
+        envs.setdefault(scenario_group(scenario, options.group_by), {})[scenario.id] = ScenarioVectorEnv(
+            scenario, n_envs, run
+        )
+    return envs

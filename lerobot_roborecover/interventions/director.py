@@ -24,10 +24,10 @@ import numpy as np
 import torch
 
 from lerobot_roborecover.env.directives import BY_RULE, Controller, Directive, attach
-from lerobot_roborecover.evaluate.host import Chunk, PolicyError
 from lerobot_roborecover.interventions.driver import Driver
 from lerobot_roborecover.interventions.members import MemberHost, join
 from lerobot_roborecover.interventions.monitor_interface import Monitor
+from lerobot_roborecover.policies.host import Chunk, PolicyError
 
 type Observation = Mapping[str, torch.Tensor]
 """After the env preprocessor, batch axis of 1."""

@@ -44,6 +44,10 @@ class Driver(Protocol):
         """The slot is no longer the driver's: handed back, or its trial is over."""
 
 
+_MOVED = {"lerobot_roborecover.build.teleop.takeover": "lerobot_roborecover.studio.teleop.takeover"}
+"""Drivers under the names that they once had, which saved configurations may hold."""
+
+
 def load_driver(name: str) -> Driver:
     """The driver that an option names.
 
@@ -54,6 +58,7 @@ def load_driver(name: str) -> Driver:
         OptionError: there is no such function, or what it returns is no driver.
     """
     module_name, _, function = name.partition(":")
+    module_name = _MOVED.get(module_name, module_name)
     try:
         made = getattr(importlib.import_module(module_name), function)()
     except (ImportError, AttributeError, ValueError) as err:

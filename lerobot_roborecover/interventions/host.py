@@ -11,15 +11,15 @@ from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.env.directives import WIDTH
-from lerobot_roborecover.evaluate.host import Chunk, PolicyError
 from lerobot_roborecover.interventions.director import Director, Episode
+from lerobot_roborecover.policies.host import Chunk, PolicyError
 
 _NOISE = ("per_trial", "per_batch", "unseeded")
 """From the best to the worst."""
 
 
 class InterventionHost:
-    """An `evaluate.host.Host`.
+    """An `trials.host.Host`.
 
     Args:
         director: the composite policy.

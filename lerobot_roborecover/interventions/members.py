@@ -16,8 +16,8 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.env.intervention_options import POLICY_TYPE
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.evaluate.policy_host import PolicyHost
 from lerobot_roborecover.interventions.configuration_intervention import MemberConfig
+from lerobot_roborecover.policies.policy_host import PolicyHost
 
 
 class MemberHost(PolicyHost):

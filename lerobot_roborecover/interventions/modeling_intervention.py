@@ -14,7 +14,6 @@ from torch import Tensor
 from lerobot_roborecover.env.directives import Controller
 from lerobot_roborecover.env.intervention_options import POLICY_TYPE
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.evaluate.host import PolicyError
 from lerobot_roborecover.interventions.configuration_intervention import (
     MonitorConfig,
     RoboRecoverInterventionConfig,
@@ -24,6 +23,7 @@ from lerobot_roborecover.interventions.driver import load_driver
 from lerobot_roborecover.interventions.host import InterventionHost, tensors
 from lerobot_roborecover.interventions.members import load_member
 from lerobot_roborecover.interventions.monitor_interface import Monitor
+from lerobot_roborecover.policies.host import PolicyError
 
 
 class RoboRecoverInterventionPolicy(PreTrainedPolicy):
@@ -62,6 +62,11 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         )
         self._episodes: list[Episode] = []
         self._rows: list[list[np.ndarray]] = []
+
+    @property
+    def policies(self) -> list[Any]:
+        """The policies that act: base and correction."""
+        return [member.parts[0] for member in self.director.members.values()]
 
     def make_host(
         self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from lerobot_roborecover.errors import RoboRecoverError
 
-class RemoteError(RuntimeError):
+
+class RemoteError(RoboRecoverError, RuntimeError):
     """A remote policy cannot be asked, or its answer cannot be used."""
 
 

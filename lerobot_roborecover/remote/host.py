@@ -10,13 +10,13 @@ import torch
 from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
-from lerobot_roborecover.evaluate.host import Chunk, PolicyError
+from lerobot_roborecover.policies.host import Chunk, PolicyError
 from lerobot_roborecover.remote.errors import RemoteError
 from lerobot_roborecover.remote.modeling_remote import RemotePolicy, Slot, split
 
 
 class RemoteHost:
-    """`evaluate.host.Host` over a policy server.
+    """`trials.host.Host` over a policy server.
 
     Args:
         policy: connected.

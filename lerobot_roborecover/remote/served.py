@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType
 
-from lerobot_roborecover.evaluate.policy_host import PolicyHost
+from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.remote.sessions import PROTOCOL, RequestError
 
 _LONGEST_SIDE = 8192

@@ -17,7 +17,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from lerobot_roborecover.evaluate.host import Chunk, PolicyError
+from lerobot_roborecover.policies.host import Chunk, PolicyError
 from lerobot_roborecover.remote.errors import RemoteError
 from lerobot_roborecover.remote.protocol import pack, unpack
 from lerobot_roborecover.remote.served import ServedPolicy

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import IO
 
-from lerobot_roborecover.env.parent import end_with_parent
+from lerobot_roborecover.workers.parent import end_with_parent
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""

@@ -1,4 +1,4 @@
-"""Runs a study's evaluation: one command after the other, each of which goes on where it was."""
+"""Runs a study's evaluation: one run after the other, each of which goes on where it was."""
 
 from __future__ import annotations
 
@@ -7,18 +7,30 @@ import shlex
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 
+from lerobot_roborecover.analysis.make import Gallery, Report, report
+from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.evaluate.sizes import usable_cores
+from lerobot_roborecover.rounding import has_kernels
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.arms import Arm, arms, report_command
 from lerobot_roborecover.study.child import run_module
-from lerobot_roborecover.study.commands import Arm, arms, report_command
 from lerobot_roborecover.study.definition import StudyDefinition
-from lerobot_roborecover.study.outcomes import Comparison, compare, outcomes_of, read_outcomes
+from lerobot_roborecover.study.outcomes import (
+    STEPS_BAND,
+    Comparison,
+    compare,
+    outcomes_of,
+    read_outcomes,
+)
+from lerobot_roborecover.trials.sizes import usable_cores
 
 DONE_FILE = "done.json"
-"""Beside the log of an arm that has finished: the command that did it."""
+"""Beside the log of an arm that has finished: the run that it was."""
+RUN_FILE = "run.yaml"
+"""Beside the log of every arm: its run, as `roborecover eval --config_path` reads it."""
 _SHOWN_LINES = 12
 
 
@@ -66,9 +78,9 @@ def evaluate(
     def run(arm: Arm) -> float:
         began, done = time.monotonic(), arm.out / DONE_FILE
         # With other slots the trials are the same: what has finished is not run again for them.
-        same = json.dumps([[a for a in arm.argv if not a.startswith("--runner.slots=")], ids])
+        same = json.dumps([replace(arm.run, runner={**arm.run.runner, "slots": 0}).config(), ids])
         if not (done.exists() and done.read_text() == same):
-            run_command(arm.argv, arm.out / "output.log", study)
+            run_arm(arm, study)
             done.write_text(same)
         return time.monotonic() - began
 
@@ -84,25 +96,34 @@ def evaluate(
 
 
 def compare_with_stored(study: StudyDefinition, done: Sequence[Arm]) -> Comparison | None:
-    """Today's outcomes against the stored ones; None where nothing is stored."""
+    """Today's outcomes against the stored ones, to the step where this processor can take the kernels that
+    the study names; None where nothing is stored."""
     if not study.outcomes.exists():
         return None
-    return compare(read_outcomes(study.outcomes), outcomes_of(done))
+    band = 0 if has_kernels() else STEPS_BAND
+    return compare(read_outcomes(study.outcomes), outcomes_of(done), band)
 
 
-def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Path:
-    """The report page of the arms' logs."""
-    run_command(report_command(study, done, out), out / "report.log", study)
-    return out / "report" / "report.html"
+def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Report:
+    """Writes the report page of the arms' logs."""
+    interventions = {"baseline": study.base, "interventions": tuple(study.interventions)}
+    return report(
+        [f"{arm.name}={arm.log}" for arm in done],
+        out / "report",
+        options=Options(**interventions) if study.interventions else None,
+        gallery=Gallery(str(study.scenarios)),
+        command=report_command(study, done, out),
+    )
 
 
-def run_command(argv: Sequence[str], log: Path, study: StudyDefinition) -> None:
-    """Runs `roborecover ARGV` as anybody would, its output into a file.
+def run_arm(arm: Arm, study: StudyDefinition) -> None:
+    """Runs an arm in a process of its own, which rounds as the study says; its output goes into a file.
 
     Raises:
         ScenarioError: it failed; the message has the end of its output.
     """
-    log.parent.mkdir(parents=True, exist_ok=True)
+    argv = arm.run.write(arm.out / RUN_FILE)
+    log = arm.out / "output.log"
     with log.open("ab") as stream:
         status = run_module("lerobot_roborecover.cli.main", argv, study.environment, stream)
     if status:

@@ -10,13 +10,15 @@ import json
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
-from lerobot_roborecover.build.chain.config import ChainConfig, read_config
+from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
+from lerobot_roborecover.journal import append_records
+from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
@@ -30,15 +32,8 @@ BASE = "act"
 CHAIN, CHAIN_ROOT = Path("policies/build/metaworld_study.yaml"), "outputs/study"
 """The scenarios' recipe, and the folder that it works in unless told otherwise."""
 INTERVENTIONS = ("reversion", "correction", "monitor_reversion", "monitor_correction")
-KERNELS: Mapping[str, str] = {
-    "OMP_NUM_THREADS": "1",
-    "ATEN_CPU_CAPABILITY": "avx2",
-    "MKL_CBWR": "COMPATIBLE",
-    "ONEDNN_MAX_CPU_ISA": "AVX2",
-}
-"""torch's kernels chosen alike on every x86-64 processor, so that policies round alike."""
 _ENV = {"obs_type": "state"}
-_TRAIN = "lerobot_roborecover.build.metaworld.frames_in_memory"
+_TRAIN = "recipes.metaworld.frames_in_memory"
 """`lerobot-train`, fed from memory: the same weights, sooner."""
 _MONITOR = Path("policies/train/monitor_small.yaml")
 _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
@@ -78,13 +73,13 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
     return [
         Stage(
             "policies",
-            (("lerobot_roborecover.build.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
+            (("recipes.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
             tuple(out / "policies" / name for name in POLICIES),
         ),
         *(
             Stage(
                 name,
-                (("lerobot_roborecover.build.metaworld.scripted_operator", "--out", str(out / name),
+                (("recipes.metaworld.scripted_operator", "--out", str(out / name),
                   "--seeds", seeds),),
                 (out / name / "meta" / "roborecover" / "candidates.json",),
                 (out / name, out / f"{name}.recordings"),
@@ -186,8 +181,7 @@ def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
             _run(command)
         minutes = (time.monotonic() - began) / 60
         say(f"{where}: {minutes:.1f} min")
-        with (out / "stages.jsonl").open("a") as file:
-            file.write(json.dumps({"stage": stage.name, "minutes": round(minutes, 1)}) + "\n")
+        append_records(out / "stages.jsonl", {"stage": stage.name, "minutes": round(minutes, 1)})
     return None if only else assemble(out)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.commands import Arm
+from lerobot_roborecover.study.arms import Arm
 
 COLUMNS = ("arm", "scenario_id", "trial", "outcome", "steps")
 
@@ -17,6 +17,11 @@ type Key = tuple[str, str, int]
 """Arm, scenario, trial."""
 type Outcomes = Mapping[Key, tuple[str, int]]
 """Outcome and steps of each trial."""
+type Difference = tuple[Key, tuple[str, int], tuple[str, int]]
+"""Key, stored, today."""
+
+STEPS_BAND = 2
+"""Where kernels cannot be chosen: how many steps apart a trial that ends alike may end."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +29,23 @@ class Comparison:
     """Trials of today against the stored ones."""
 
     same: int
-    different: tuple[tuple[Key, tuple[str, int], tuple[str, int]], ...]
-    """Key, stored, today."""
+    different: tuple[Difference, ...]
     unknown: int
     """Trials of today that are not stored."""
+    close: tuple[Difference, ...] = ()
+    """Trials that ended alike, after other steps, within the band."""
+    steps_band: int = 0
+    """How many steps apart a trial that ends alike may end."""
 
     def text(self, limit: int = 10) -> str:
         """A few lines for people."""
-        compared = self.same + len(self.different)
+        compared = self.same + len(self.different) + len(self.close)
         lines = [f"{self.same} of {compared} trials came out as stored, to the step"]
+        if self.close:
+            lines.append(
+                f"{len(self.close)} more ended alike, at most {self.steps_band} steps sooner or later: this "
+                "processor cannot take the kernels that the stored ones were computed with"
+            )
         if self.unknown:
             lines.append(f"{self.unknown} trials are not among the stored ones")
         for (arm, scenario, trial), stored, today in self.different[:limit]:
@@ -83,8 +96,25 @@ def read_outcomes(path: Path) -> dict[Key, tuple[str, int]]:
     return found
 
 
-def compare(stored: Outcomes, today: Outcomes) -> Comparison:
-    """Compares the trials that are in both."""
+def compare(stored: Outcomes, today: Outcomes, steps_band: int = 0) -> Comparison:
+    """Compares the trials that are in both.
+
+    Args:
+        stored: of the machine that stored them.
+        today: of this one.
+        steps_band: how many steps apart a trial may end whose outcome is the stored one.
+    """
     both = sorted(stored.keys() & today.keys())
-    different = tuple((k, stored[k], today[k]) for k in both if stored[k] != today[k])
-    return Comparison(len(both) - len(different), different, len(today.keys() - stored.keys()))
+    other = [(k, stored[k], today[k]) for k in both if stored[k] != today[k]]
+
+    def near(difference: Difference) -> bool:
+        (before, then), (outcome, steps) = difference[1:]
+        return before == outcome and abs(steps - then) <= steps_band
+
+    return Comparison(
+        same=len(both) - len(other),
+        different=tuple(d for d in other if not near(d)),
+        unknown=len(today.keys() - stored.keys()),
+        close=tuple(d for d in other if near(d)),
+        steps_band=steps_band,
+    )

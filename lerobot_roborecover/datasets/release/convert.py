@@ -3,34 +3,39 @@ on."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
-from typing import Any
+from pathlib import Path
 
-from lerobot_roborecover.datasets.release.record import KEY, RULES, Sources, to_json, to_scenario
+from lerobot_roborecover.datasets.release.json_form import KEY
+from lerobot_roborecover.datasets.release.record import (
+    RULES,
+    LiftedByOption,
+    Reading,
+    to_scenario,
+)
 from lerobot_roborecover.datasets.release.tables import (
     MAX_RECORD_BYTES,
-    MAX_TABLE_BYTES,
     PLATFORMS,
     SPLITS,
     SplitRow,
     SplitTable,
     check_row,
-    format_table,
+    find_tables,
     read_file,
     read_table,
-    safe_path,
     table_name,
 )
 from lerobot_roborecover.datasets.schema import check_limits
-from lerobot_roborecover.scenario import Scenario, ScenarioError, Source
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.scenario import Scenario, ScenarioError
+
+_AS_RELEASED = (
+    "The file has the hash of its table, so that fetching it again changes nothing: tell those who published "
+    "the release"
+)
 
 
 @dataclass(frozen=True)
@@ -60,40 +65,52 @@ class Conversion:
     warnings: list[Problem] = field(default_factory=list)
 
 
-def platforms_of(root: Path) -> list[str]:
-    """The platforms for which a release has a split table."""
-    return [p for p in PLATFORMS if any((root / table_name(p, s)).exists() for s in SPLITS)]
+def platforms_of(root: Path, tables: Path | None = None) -> list[str]:
+    """The platforms for which a release has a split table; arguments as of `read_release`."""
+    folder = find_tables(tables or root)
+    return [p for p in PLATFORMS if any((folder / f"{p}_{s}.csv").exists() for s in SPLITS)]
 
 
 def read_release(
     root: str | os.PathLike[str],
     platform: str,
     *,
-    sources: Sources = RULES,
-    keep_extra: bool = False,
+    tables: str | os.PathLike[str] | None = None,
+    reading: Reading = RULES,
 ) -> Conversion:
     """Reads every record of one platform.
 
     Args:
-        root: the release's folder, the one that holds `splits/`.
+        root: the folder that holds `libero/` and `robotwin/`.
         platform: `libero` or `robotwin`.
-        sources: tells natural, perturbed and human records apart.
-        keep_extra: keep unknown fields in the provenance instead of refusing their records.
+        tables: the folder of the split tables, or the one that holds `splits/`; `root` by default. The tables
+            lie in the release's git repository, the records in an archive.
+        reading: what is taken.
 
     Raises:
-        ScenarioError: there is no split table, or one is no table of the release format. A bad record raises
-            nothing: it is among the failures.
+        ScenarioError: there is no split table, one is no table of the release format, or none of the files is
+            there. A bad record raises nothing: it is among the failures.
     """
     root = Path(root)
     result = Conversion(platform)
-    tables = [t for t in (read_table(root, platform, s) for s in SPLITS) if t is not None]
-    if not tables:
+    folder = find_tables(Path(tables) if tables else root)
+    found = [t for t in (read_table(folder, platform, s) for s in SPLITS) if t is not None]
+    if not found:
         raise ScenarioError(
-            f"{root} has no {table_name(platform, 'train')} or {table_name(platform, 'test')}; name the "
-            "release's folder, the one that holds splits/"
+            f"{tables or root} has no {table_name(platform, 'train')} or {table_name(platform, 'test')}. "
+            "Name the release's folder, the one that holds splits/; where the tables lie apart from the "
+            "data, in the git clone, name that with --splits. JSON files are converted without a table when "
+            "they are named themselves"
         )
     hashes: dict[tuple[str, str], str] = {}
-    for table, row in _usable_rows(tables, result):
+    rows = _usable_rows(found, result)
+    if rows and not any((root / row.path).exists() for _, row in rows):
+        raise ScenarioError(
+            f"{root} has none of the {len(rows)} files that its tables name, such as {rows[0][1].path}. The "
+            "records are an archive apart from the git clone: unpack it, name its folder (the one that holds "
+            f"{rows[0][1].path.parts[0]}/), and the tables' with --splits"
+        )
+    for table, row in rows:
         name = str(row.path)
         try:
             data = read_file(root, row.path, MAX_RECORD_BYTES)
@@ -103,32 +120,16 @@ def read_release(
                     f"SHA-256 is {digest}, {table.name} (row {row.number}, column sha256) says "
                     f"{row.cells['sha256']}: the file is not the one that was released. Fetch it again"
                 )
-            scenario = to_scenario(
-                platform,
-                data,
-                split=table.split,
-                sample_id=row.sample_id,
-                prefix_steps=row.replay_prefix_steps,
-                sources=sources,
-                keep_extra=keep_extra,
-            )
-            _check_against_row(scenario, row)
-            note = {
-                **scenario.provenance[KEY],
-                "split_row": row.cells,
-                "row": row.number,
-                "table": {"newline": table.newline, "bom": table.bom},
-            }
-            scenario = replace(scenario, provenance={KEY: note})
-            check_limits(scenario)
+            scenario = read_record(platform, data, table, row, reading, _AS_RELEASED)
         except ScenarioError as err:
             result.failures.append(Problem(name, None, row.sample_id, _without_name(err, name)))
             continue
         result.scenarios.append(scenario)
         hashes[(table.split, row.sample_id)] = digest
     _refuse_leaks(result, hashes)
-    _report_unlisted(root, tables, result)
-    for table in tables:
+    _report_unlisted(root, found, result)
+    warn_of_instructions(result)
+    for table in found:
         if not table.reproducible:
             result.warnings.append(
                 Problem(
@@ -141,91 +142,67 @@ def read_release(
     return result
 
 
-def read_sources(path: str | os.PathLike[str]) -> Sources:
-    """Reads exceptions to the rules of sources: a CSV with columns name, source, source_policy.
-
-    Raises:
-        ScenarioError: the file is no such table.
-    """
-    path = Path(path)
-    data = read_file(path.parent, PurePosixPath(path.name), MAX_TABLE_BYTES)
-    rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig", "replace"), newline="")))
-    table = {}
-    for number, row in enumerate(rows, 1):
-        if set(row) != {"name", "source", "source_policy"} or None in row.values():
-            raise ScenarioError(f"{path}, row {number}: the columns must be name, source, source_policy")
-        if row["source"] not in set(Source):
-            raise ScenarioError(
-                f"{path}, row {number}, column source: {row['source']!r:.80} is not one of "
-                f"{', '.join(Source)}"
-            )
-        table[row["name"]] = (Source(row["source"]), row["source_policy"])
-    return Sources(table)
-
-
-def export_release(scenarios: Sequence[Scenario], out: str | os.PathLike[str]) -> list[Problem]:
-    """Writes converted scenarios back as the release's JSON files and split tables.
+def read_record(
+    platform: str, data: bytes, table: SplitTable, row: SplitRow, reading: Reading, remedy: str
+) -> Scenario:
+    """One record with its row as a scenario, checked against the row.
 
     Args:
-        scenarios: as `read_release` made them, of any of the platforms.
-        out: a new or empty folder.
-
-    Returns:
-        Files whose hash differs from the one in their split table.
+        platform: `libero` or `robotwin`.
+        data: the file's bytes.
+        table: that has the row.
+        row: says id, split and prefix.
+        reading: what is taken.
+        remedy: what somebody who downloaded the file can do about a bad record.
 
     Raises:
-        ScenarioError: the folder is not empty, or a scenario was not made from a release; nothing is written
-            outside the folder, whatever a dataset's provenance says.
+        ScenarioError: names the field, the value, and the remedy.
     """
-    out = Path(out)
-    changed = []
-    tables: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
-    with new_folder(out) as folder:
-        for scenario in scenarios:
-            data = to_json(scenario)
-            number, note, row = _export_note(scenario)
-            target = folder / row.path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with open(target, "xb") as file:
-                    file.write(data)
-            except OSError as err:
-                raise ScenarioError(f"scenario {scenario.id}: {row.path} cannot be written: {err}") from None
-            if hashlib.sha256(data).hexdigest() != row.cells["sha256"]:
-                changed.append(
-                    Problem(str(row.path), None, scenario.id, "its hash is not that of its split table")
-                )
-            tables.setdefault(table_name(scenario.platform, scenario.split), []).append((number, note))
-        for name, rows in tables.items():
-            rows.sort(key=lambda item: item[0])
-            form = rows[0][1]["table"]
-            target = folder / safe_path(name, "split table")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(
-                format_table([dict(n["split_row"]) for _, n in rows], form["newline"], form["bom"])
-            )
-    return changed
-
-
-def _export_note(scenario: Scenario) -> tuple[int, Mapping[str, Any], SplitRow]:
-    """Row number, provenance note and split row of a converted scenario, checked again: it may come from
-    anyone."""
-    note = scenario.provenance[KEY]
     try:
-        number, cells, table = note["row"], note["split_row"], note["table"]
-        good = type(number) is int and table["newline"] in ("\n", "\r\n") and type(table["bom"]) is bool
-        good = (
-            good and all(isinstance(c, str) for c in cells.values()) and set(cells) >= {"sample_id", "path"}
+        scenario = to_scenario(
+            platform,
+            data,
+            split=table.split,
+            sample_id=row.sample_id,
+            prefix_steps=row.replay_prefix_steps,
+            reading=reading,
         )
-        if not good:
-            raise ValueError
-        return number, note, check_row(number, dict(cells))
-    except (KeyError, TypeError, AttributeError, ValueError) as err:
-        detail = f": {err}" if isinstance(err, ScenarioError) else ""
-        raise ScenarioError(
-            f"scenario {scenario.id}, field provenance.{KEY}: not what the conversion of a release "
-            f"writes{detail}; only converted scenarios can be exported"
-        ) from None
+        check_limits(scenario)
+    except LiftedByOption:
+        raise
+    except ScenarioError as err:
+        raise ScenarioError(f"{err}. {remedy}") from None
+    _check_against_row(scenario, row)
+    note = {
+        **scenario.provenance[KEY],
+        "split_row": row.cells,
+        "row": row.number,
+        "table": {"newline": table.newline, "bom": table.bom},
+    }
+    scenario = replace(scenario, provenance={KEY: note})
+    check_limits(scenario)
+    return scenario
+
+
+def warn_of_instructions(result: Conversion) -> None:
+    """Says where policies are prompted with other words than a record's `task_description`."""
+    others: dict[tuple[str, str, str], list[Scenario]] = {}
+    for scenario in result.scenarios:
+        said = scenario.provenance[KEY]["record"]["task_description"]
+        # RoboTwin's record has an instruction of its own, which its evaluators prompt with.
+        if scenario.platform == "libero" and said != scenario.task.instruction:
+            name = scenario.provenance[KEY]["split_row"]["task_name"]
+            others.setdefault((name, said, scenario.task.instruction), []).append(scenario)
+    for (name, said, prompt), scenarios in sorted(others.items()):
+        result.warnings.append(
+            Problem(
+                scenarios[0].provenance[KEY]["split_row"]["path"],
+                None,
+                scenarios[0].id,
+                f"field task_description of {len(scenarios)} record(s) of {name}: {said!r:.200}; policies "
+                f"are prompted with LIBERO's own {prompt!r}, as the paper's evaluators do. Both are kept",
+            )
+        )
 
 
 def _usable_rows(tables: Sequence[SplitTable], result: Conversion) -> list[tuple[SplitTable, SplitRow]]:
@@ -253,7 +230,7 @@ def _usable_rows(tables: Sequence[SplitTable], result: Conversion) -> list[tuple
                             "them is converted: keep one"
                         )
             except ScenarioError as err:
-                result.failures.append(Problem(table.name, number, cells["sample_id"][:140], str(err)))
+                result.failures.append(Problem(table.name, number, cells["sample_id"][:255], str(err)))
             else:
                 usable.append((table, row))
     return usable

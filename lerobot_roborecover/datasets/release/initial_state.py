@@ -1,4 +1,5 @@
-"""Compares a simulator's first state with the one that a record of the release says it had."""
+"""Compares a simulator's first state with the one that a record of the release says it had, and LIBERO's
+fixtures, of which a record says nothing, with where its seed puts them."""
 
 from __future__ import annotations
 
@@ -7,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.datasets.release.record import KEY
+from lerobot_roborecover.datasets.release.fixtures import angle_rad, check_fixtures
+from lerobot_roborecover.datasets.release.json_form import KEY
+from lerobot_roborecover.datasets.release.robot import check_robot
+from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Scenario, ScenarioError
-from lerobot_roborecover.simulators.base import Simulator
 
 _POSITION_MM = HANDOFF_TOLERANCE_M * 1e3
 _ROTATION_RAD = 0.02
@@ -34,7 +37,7 @@ def check_initial_state(simulator: Simulator, scenario: Scenario) -> dict[str, f
     """Measures how far a simulator, just reset, is from the record's `initial_state`.
 
     Returns:
-        Deviations by the names of `LIMITS`.
+        Deviations by the names of `LIMITS`, on LIBERO with `fixture_mm` and `fixture_rad`.
 
     Raises:
         ScenarioError: names every part that is off, its size and its limit.
@@ -53,20 +56,21 @@ def check_initial_state(simulator: Simulator, scenario: Scenario) -> dict[str, f
             f"field initial_state: {', '.join(off)}. Compare versions and assets (roborecover doctor), and "
             f"the record's {keys}"
         )
-    return found
+    return found | check_fixtures(simulator, scenario) if scenario.platform == "libero" else found
 
 
 def _libero(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
     robot = simulator.observe()["robot_state"]
     return {
         "position_mm": _distance_mm(robot["eef"]["pos"], said["xyz"]),
-        "rotation_rad": _angle_rad(robot["eef"]["quat"], said["quat"]),
+        "rotation_rad": angle_rad(robot["eef"]["quat"], said["quat"]),
         "gripper_mm": abs(float(robot["gripper"]["qpos"][0]) - said["gripper"]) * 1e3,
     }
 
 
 def _robotwin(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
     """What RoboTwin's `get_obs` calls `joint_action.vector` and `endpose`, which needs no rendering."""
+    check_robot(simulator.checkout.robot, said)
     task = simulator.robotwin_task
     arms = np.arange(14) % 7 != 6
     joints = np.abs(task.joint_state() - np.asarray(said["joint_vector"], dtype=np.float64))
@@ -75,7 +79,7 @@ def _robotwin(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
     for i, side in enumerate(("left", "right")):
         pose, opening, end = said[f"{side}_endpose"], said[f"{side}_gripper"], ends[8 * i : 8 * i + 8]
         found[f"{side}_position_mm"] = _distance_mm(end[:3], pose[:3])
-        found[f"{side}_rotation_rad"] = _angle_rad(end[3:7], pose[3:])
+        found[f"{side}_rotation_rad"] = angle_rad(end[3:7], pose[3:])
         # The opening is recorded twice.
         found[f"{side}_gripper"] = max(abs(float(end[7]) - opening), float(joints[7 * i + 6]))
     return found
@@ -83,11 +87,3 @@ def _robotwin(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
 
 def _distance_mm(found: Any, said: Any) -> float:
     return float(np.linalg.norm(np.subtract(found, said))) * 1e3
-
-
-def _angle_rad(found: Any, said: Any) -> float:
-    """Angle between two rotations given as quaternions of the same order."""
-    a, b = (np.asarray(q, dtype=np.float64) for q in (found, said))
-    a, b = a / max(float(np.linalg.norm(a)), 1e-12), b / max(float(np.linalg.norm(b)), 1e-12)
-    # Between two unit vectors this is exact near zero, where arccos is not.
-    return float(4 * np.arcsin(min(np.linalg.norm(a - b), np.linalg.norm(a + b)) / 2))

@@ -6,45 +6,88 @@ to the provenance, so that `to_json` gives the file back byte for byte.
 
 from __future__ import annotations
 
-import base64
-import json
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.scenario import MAX_PREFIX_STEPS, Reset, Scenario, ScenarioError, Source, Task
-from lerobot_roborecover.simulators.catalog import LIBERO_HORIZONS, libero_tasks
-from lerobot_roborecover.simulators.libero_settle import leading_no_ops
-from lerobot_roborecover.simulators.robotwin_limits import ACTION_DIMS, STEP_LIMITS
+from lerobot_roborecover.datasets.release.json_form import KEY, form_of, parse_json
+from lerobot_roborecover.datasets.release.sources import Sources
+from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_instruction, libero_tasks
+from lerobot_roborecover.platforms.libero.settle import leading_no_ops
+from lerobot_roborecover.platforms.robotwin.limits import ACTION_DIMS, STEP_LIMITS
+from lerobot_roborecover.scenario import (
+    MAX_ACTION_MAGNITUDE,
+    MAX_PREFIX_STEPS,
+    DeviationType,
+    Reset,
+    Scenario,
+    ScenarioError,
+    Stage,
+    Task,
+)
 
-KEY = "release"
-"""Where a scenario's provenance holds what `to_json` and the export need."""
+LIBERO_SEED = 7
+"""The release resets every LIBERO scenario with `env.seed(7)`."""
+
+
+class LiftedByOption(ScenarioError):
+    """A record is refused as long as nobody asks for it by the option that the message names."""
 
 
 @dataclass(frozen=True)
-class Sources:
-    """Who drove, from the name that a record gives; the rules are those of `docs/convert.md`."""
+class Reading:
+    """How records are read."""
 
-    table: Mapping[str, tuple[Source, str]] = field(default_factory=dict)
-    """Names that the rules get wrong: source and source policy by `model_name` or `policy_name`."""
-
-    def of(self, name: str) -> tuple[Source, str]:
-        """Source and source policy of a recorded name."""
-        if name in self.table:
-            return self.table[name]
-        lower = name.lower()
-        if lower.endswith("_disturb"):
-            return Source.PERTURBED, name[: -len("_disturb")]
-        if lower.startswith(("human", "teleop", "spacemouse", "operator")):
-            return Source.HUMAN, name
-        return Source.NATURAL, name
+    sources: Sources = field(default_factory=Sources)
+    """Rules and exceptions that tell natural, perturbed and human scenarios apart."""
+    keep_extra: bool = False
+    """Keep fields that the format does not name in the provenance, instead of refusing their records."""
+    any_seed: bool = False
+    """Take LIBERO records whose seed is not the release's, each with its own."""
 
 
-RULES = Sources()
-"""The rules without exceptions."""
+RULES = Reading()
+"""Nothing but what the format says, without exceptions."""
+
+
+def look(data: bytes) -> tuple[str, str, int, tuple[str, str]]:
+    """What a split table would say of a file, from the record alone; `to_scenario` checks it.
+
+    Returns:
+        Platform, task name, number of actions, stage and deviation type.
+
+    Raises:
+        ScenarioError: it is no record of the release.
+    """
+    record = parse_json(data)
+    actions = record.get("actions")
+    count = len(actions) if isinstance(actions, list) else 0
+    labels = str(record.get("s_stage")), str(record.get("d_stage"))
+    if "task_id" in record:
+        return "libero", f"{record.get('task_suite_name')}/{record['task_id']}", count, labels
+    if "task_config" in record:
+        return "robotwin", str(record.get("task_name")), count, labels
+    raise ScenarioError(
+        "neither a LIBERO record, which has a field task_id, nor a RoboTwin record, which has task_config; "
+        f"its fields are {', '.join(record)!s:.200}"
+    )
+
+
+def check_seed(seed: int | None, reading: Reading) -> None:
+    """Checks that a LIBERO reset has the release's seed.
+
+    Raises:
+        LiftedByOption: it has another, and nobody asked for that.
+    """
+    if seed != LIBERO_SEED and not reading.any_seed:
+        raise LiftedByOption(
+            f"field seed: {seed}; the release resets every LIBERO scenario with env.seed({LIBERO_SEED}). "
+            "Another seed puts fixtures millimetres to centimetres elsewhere, which no field of a record "
+            "would show. To take such records with their own seeds: --any-seed"
+        )
 
 
 def to_scenario(
@@ -54,8 +97,7 @@ def to_scenario(
     split: str,
     sample_id: str,
     prefix_steps: int,
-    sources: Sources = RULES,
-    keep_extra: bool = False,
+    reading: Reading,
 ) -> Scenario:
     """Reads one record.
 
@@ -65,25 +107,33 @@ def to_scenario(
         split: `train` or `test`.
         sample_id: the scenario's id.
         prefix_steps: how many of the record's actions lead to the recovery point.
-        sources: rules and exceptions that tell natural, perturbed and human scenarios apart.
-        keep_extra: keep fields that the format does not name, instead of refusing the record.
+        reading: what is taken.
 
     Raises:
-        ScenarioError: names the field, the value and the remedy.
+        ScenarioError: names the field, the value and what it may be; what to do about it depends on where
+            the file is from, which its reader knows.
     """
-    record = _parse(data)
-    _check_fields(platform, record, keep_extra)
+    record = parse_json(data)
+    _check_fields(platform, record, reading.keep_extra)
+    if platform == "libero":
+        check_seed(record["seed"], reading)
     actions, integers = _actions(record["actions"])
     _check_prefix(record["annotated_step"], len(actions), prefix_steps)
-    note: dict[str, Any] = {"record": {**record, "actions": None}, "json": _form(data, record)}
+    note: dict[str, Any] = {"record": {**record, "actions": None}, "json": form_of(data, record)}
     if integers:
         note["integers"] = integers
     if prefix_steps < len(actions):
         note["tail"] = actions[prefix_steps:].tolist()
     prefix = actions[:prefix_steps]
+    too_large = np.argwhere(np.abs(prefix) > MAX_ACTION_MAGNITUDE)
+    if len(too_large):
+        i, j = too_large[0]
+        raise ScenarioError(
+            f"field actions[{i}][{j}]: {prefix[i, j]:g}; of a magnitude the limit is {MAX_ACTION_MAGNITUDE:g}"
+        )
     make = _libero if platform == "libero" else _robotwin
     task, reset, driver, cluster = make(record, prefix)
-    source, policy = sources.of(driver)
+    source, policy = reading.sources.of(driver)
     return Scenario(
         id=sample_id,
         task=task,
@@ -99,64 +149,17 @@ def to_scenario(
     )
 
 
-def to_json(scenario: Scenario) -> bytes:
-    """The scenario's file as it was, byte for byte.
-
-    Raises:
-        ScenarioError: the scenario was not made from the release.
-    """
-    note = scenario.provenance.get(KEY)
-    try:
-        form = note["json"]
-        if "zlib" in form:
-            unpacker = zlib.decompressobj()
-            data = unpacker.decompress(base64.b64decode(form["zlib"]), 2**24)
-            if unpacker.unconsumed_tail:
-                raise ValueError("more than 16 MiB")
-            return data
-        rows = [*scenario.prefix.tolist(), *note.get("tail", [])]
-        if "integers" in note:
-            width = scenario.prefix.shape[1]
-            flags = np.unpackbits(np.frombuffer(bytes.fromhex(note["integers"]), np.uint8))
-            for i in np.flatnonzero(flags[: len(rows) * width]):
-                rows[i // width][i % width] = int(rows[i // width][i % width])
-        return _dump({**note["record"], "actions": rows}, form)
-    except (KeyError, TypeError, ValueError, IndexError, zlib.error) as err:
-        raise ScenarioError(
-            f"scenario {scenario.id}, field provenance.{KEY}: not what the conversion of a release writes "
-            f"({err!r:.100}); only converted scenarios can be exported"
-        ) from None
-
-
-def _parse(data: bytes) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) != len(pairs):
-            names = [name for name, _ in pairs]
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"the field {twice!r:.80} occurs twice")
-        return found
-
-    def refuse(name: str) -> None:
-        raise ValueError(f"it holds {name}; numbers must be finite. Record the rollout again")
-
-    try:
-        record = json.loads(data, parse_constant=refuse, object_pairs_hook=unique)
-        # Half of an escaped surrogate pair is no text, and 1e999 no number, though JSON's reader takes both.
-        json.dumps(record, ensure_ascii=False, allow_nan=False).encode()
-    except (ValueError, RecursionError) as err:
-        raise ScenarioError(f"not usable JSON: {err}") from None
-    if not isinstance(record, dict):
-        raise ScenarioError(f"a JSON {type(record).__name__}, not an object with a record's fields")
-    return record
-
-
 def _integer(value: Any) -> str:
     return "" if type(value) is int and 0 <= value < 2**32 else "an integer from 0 to 2^32 - 1"
 
 
 def _text(value: Any) -> str:
     return "" if isinstance(value, str) and 0 < len(value) <= 2000 else "text of 1 to 2000 characters"
+
+
+def _one_of(labels: type[StrEnum]) -> Callable[[Any], str]:
+    wanted = f"one of {', '.join(labels)}"
+    return lambda value: "" if value in tuple(labels) else wanted
 
 
 def _anything(value: Any) -> str:
@@ -190,8 +193,8 @@ _COMMON: dict[str, Callable[[Any], str]] = {
     "task_suite_name": _text,
     "data_type": _anything,
     "model_name": _anything,
-    "s_stage": _text,
-    "d_stage": _text,
+    "s_stage": _one_of(Stage),
+    "d_stage": _one_of(DeviationType),
     "annotated_step": _integer,
     "actions": _anything,
 }
@@ -230,7 +233,7 @@ def _check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) ->
         raise ScenarioError(f"field {missing[0]}: missing; a {platform} record has {', '.join(fields)}")
     extra = [name for name in record if name not in fields and name not in _OPTIONAL[platform]]
     if extra and not keep_extra:
-        raise ScenarioError(
+        raise LiftedByOption(
             f"field {extra[0]!r:.80}: not of the {platform} release format; convert with --keep-extra to "
             "keep such fields in the provenance"
         )
@@ -250,14 +253,14 @@ def _actions(value: Any) -> tuple[np.ndarray, str]:
     for i, row in enumerate(value):
         if len(row) != width:
             raise ScenarioError(
-                f"field actions[{i}]: {len(row)} numbers, actions[0] has {width}; record the rollout again"
+                f"field actions[{i}]: {len(row)} numbers, actions[0] has {width}; all have the same"
             )
         kinds.update(map(type, row))
     if not kinds <= {int, float}:
         i, j, bad = next(
             (i, j, v) for i, row in enumerate(value) for j, v in enumerate(row) if type(v) not in (int, float)
         )
-        raise ScenarioError(f"field actions[{i}][{j}]: {bad!r:.80} is not a number; record the rollout again")
+        raise ScenarioError(f"field actions[{i}][{j}]: {bad!r:.80} is not a number")
     try:
         actions = np.array(value, dtype=np.float64)
     except OverflowError:
@@ -277,8 +280,9 @@ def _check_prefix(annotated_step: int, actions: int, prefix_steps: int) -> None:
     # A record keeps the frame of the annotation or the action after it, so that both counts occur.
     if prefix_steps not in (annotated_step, annotated_step + 1):
         raise ScenarioError(
-            f"field annotated_step: {annotated_step}, but the split table replays {prefix_steps} actions; "
-            "the two conventions of the release are annotated_step and annotated_step + 1"
+            f"field annotated_step: {annotated_step}, but {prefix_steps} actions are replayed (column "
+            "replay_prefix_steps; without a split table, all of them); the two conventions of the release "
+            "are annotated_step and annotated_step + 1"
         )
 
 
@@ -290,8 +294,10 @@ def _libero(record: Mapping[str, Any], prefix: np.ndarray) -> tuple[Task, Reset,
     if number >= len(suites[suite]):
         raise ScenarioError(f"field task_id: {number}; {suite} has tasks 0 to {len(suites[suite]) - 1}")
     _check_width(prefix, (7,), "a LIBERO action")
+    name = suites[suite][number]
+    # The paper's evaluators prompt with LIBERO's `task.language`; `task_description` often has other words.
     return (
-        Task("libero", suite, suites[suite][number], record["task_description"], LIBERO_HORIZONS[suite]),
+        Task("libero", suite, name, libero_instruction(name), LIBERO_HORIZONS[suite]),
         Reset(
             seed=record["seed"],
             init_state_index=record["episode_idx"],
@@ -326,29 +332,3 @@ def _check_width(prefix: np.ndarray, widths: tuple[int, ...], what: str) -> None
         raise ScenarioError(
             f"field actions: width {prefix.shape[1]}; {what} has {' or '.join(map(str, widths))} numbers"
         )
-
-
-def _form(data: bytes, record: Mapping[str, Any]) -> dict[str, Any]:
-    """How the file was written: what `_dump` needs to write it again, or the file itself, packed."""
-    text = data.decode("utf-8")
-    body = text.rstrip()
-    form: dict[str, Any] = {"ascii": text.isascii(), "end": text[len(body) :]}
-    if body.startswith("{\n"):
-        form["indent"] = len(body) - len(body[2:].lstrip(" ")) - 2
-    elif body[:1] == "{":
-        form["separators"] = [", ", ": "] if '": ' in body else [",", ":"]
-    if len(form["end"]) <= 2 and form.get("indent", 0) <= 8 and _dump(record, form) == data:
-        return form
-    return {"zlib": base64.b64encode(zlib.compress(data, 9)).decode()}
-
-
-def _dump(record: Mapping[str, Any], form: Mapping[str, Any]) -> bytes:
-    separators = form.get("separators")
-    text = json.dumps(
-        record,
-        ensure_ascii=form["ascii"],
-        indent=form.get("indent"),
-        separators=tuple(separators) if separators else None,
-        allow_nan=False,
-    )
-    return (text + form["end"]).encode("utf-8")

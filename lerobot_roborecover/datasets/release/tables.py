@@ -12,7 +12,7 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import ID_RULE, ScenarioError, is_id, shown_id
 
 SPLITS = ("train", "test")
 PLATFORMS = ("libero", "robotwin")
@@ -31,7 +31,6 @@ MAX_TABLE_BYTES = 2**26
 MAX_RECORD_BYTES = 2**24
 
 _HASH = re.compile(r"[0-9a-f]{64}")
-_SAMPLE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 @dataclass(frozen=True)
@@ -75,16 +74,29 @@ def table_name(platform: str, split: str) -> str:
     return f"splits/{platform}_{split}.csv"
 
 
-def read_table(root: Path, platform: str, split: str) -> SplitTable | None:
-    """Reads a split table; None where the release has none for this platform and split.
+def find_tables(root: Path) -> Path:
+    """The folder that holds the split tables: `splits` below `root`, or `root` where that is named itself."""
+    given = [root / PurePosixPath(table_name(p, s)).name for p in PLATFORMS for s in SPLITS]
+    inside = not (root / "splits").is_dir() and any(path.is_file() for path in given)
+    return root if inside else root / "splits"
+
+
+def read_table(folder: Path, platform: str, split: str) -> SplitTable | None:
+    """Reads a split table; None where there is none for this platform and split.
+
+    Args:
+        folder: of the tables, as `find_tables` gives it.
+        platform: `libero` or `robotwin`.
+        split: `train` or `test`.
 
     Raises:
         ScenarioError: the file is no CSV of the release's columns.
     """
     name = table_name(platform, split)
-    if not (root / name).exists() and not (root / name).is_symlink():
+    file = PurePosixPath(name).name
+    if not (folder / file).exists() and not (folder / file).is_symlink():
         return None
-    data = read_file(root, PurePosixPath(name), MAX_TABLE_BYTES)
+    data = read_file(folder, PurePosixPath(file), MAX_TABLE_BYTES)
     bom = data.startswith(b"\xef\xbb\xbf")
     try:
         text = data.decode("utf-8-sig")
@@ -127,10 +139,9 @@ def check_row(number: int, cells: dict[str, str]) -> SplitRow:
     Raises:
         ScenarioError: names the column, the value and what it must be.
     """
-    if not _SAMPLE_ID.fullmatch(cells["sample_id"]):
+    if not is_id(cells["sample_id"]):
         raise ScenarioError(
-            f"column sample_id: {cells['sample_id']!r:.80} is not 1 to 128 letters, digits, '.', '_' or '-'; "
-            "rename the sample"
+            f"column sample_id: {shown_id(cells['sample_id'])} is not {ID_RULE}; rename the sample"
         )
     for column in ("sha256", "original_sha256"):
         if not _HASH.fullmatch(cells[column]) and (column == "sha256" or cells[column]):
@@ -173,14 +184,18 @@ def safe_path(text: str, where: str) -> PurePosixPath:
 def read_file(root: Path, path: PurePosixPath, limit: int) -> bytes:
     """The bytes of one regular file inside the release.
 
+    Its first two folders may be links to wherever the data was unpacked (`libero`, `libero/test`): those a
+    user makes. A link of the file itself, or of a folder further down, may not lead out of them.
+
     Raises:
         ScenarioError: it is missing, leads out of the release, is no regular file, or is too large.
     """
     try:
         real = (root / path).resolve(strict=True)
-        if not real.is_relative_to(root.resolve()):
+        if not real.is_relative_to(root.joinpath(*path.parent.parts[:2]).resolve()):
             raise ScenarioError(
-                f"{path} is a link that leaves the release, to {real}; put the file itself there"
+                f"{path} is a link that leaves the release, to {real}; link its folder, or put the file "
+                "itself there"
             )
         status = real.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:

@@ -1,0 +1,87 @@
+"""The result of a report in a few sentences: who is ranked first, how surely, and from whom it is told."""
+
+from __future__ import annotations
+
+import math
+
+from lerobot_roborecover.analysis.contrasts import Contrast
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
+
+
+def headline(results: Results) -> str:
+    """The result in a few sentences, every claim by `verdicts.py`."""
+    best = results.best_first[0]
+    name, rate = results.ranked.arms[best], results.ranked_rates[best]
+    sentences = [
+        f"{name} recovers in {100 * rate.value:.1f} % of its trials, averaged over scenarios"
+        + _intervals(results, best, rate)
+        + "."
+    ]
+    if results.several_runs:
+        sentences.append(_method(results, name))
+    if not results.compared.complete:
+        sentences.append(_who(results))
+    rivals = [results.ranked.arms[p] for p in results.best_first[1:]]
+    if rivals:
+        sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))
+    return " ".join(sentences)
+
+
+def _method(results: Results, name: str) -> str:
+    """What its runs say of the method."""
+    found = results.method_rates[results.recovery.arm(name)]
+    if len(found.each) == 1:
+        return "That is one run, and nothing is said of the method behind it."
+    span = f"{100 * found.lowest:.1f} to {100 * found.highest:.1f} %"
+    text = f"That is the mean of {len(found.each)} runs ({span})"
+    if not math.isnan(found.other_runs.low):
+        text += f"; for other runs like these, {_bounds(found.other_runs)}"
+    return f"{text}. Whom it is separated from below is said of these runs."
+
+
+def _intervals(results: Results, best: int, rate: Estimate) -> str:
+    if math.isnan(rate.low):
+        return ""
+    level = f"{100 * results.draws.level:g} % interval"
+    text = f" ({level} {_bounds(rate)}, over {results.ranked_draws.units} {results.unit}"
+    if results.tasks is not None:
+        draws = results.tasks.part(list(results.compared.scenarios))
+        (tasks,) = draws.rates(results.ranked.rates[[best]].T)
+        if not math.isnan(tasks.low):
+            text += f"; {_bounds(tasks)} for other tasks like these {draws.units}"
+    return text + ")"
+
+
+def _bounds(rate: Estimate) -> str:
+    return f"{100 * rate.low:.1f} to {100 * rate.high:.1f}"
+
+
+def _who(results: Results) -> str:
+    count, whole = len(results.ranked.scenarios), len(results.recovery.scenarios)
+    on = f"Ranked on the {count} of {whole} scenarios that were run by all of them"
+    if not results.left_out:
+        return f"{on}."
+    if count == whole:
+        on = "Ranked are the policies that were run on all scenarios"
+    return f"{on}; not ranked, because not run on all of these: {', '.join(results.left_out)}."
+
+
+def _standing(best: str, found: list[Contrast]) -> str:
+    """From whom the first is separated, and from whom not."""
+    few = [c.b for c in found if c.verdict is Verdict.TOO_FEW]
+    level = [c.b for c in found if not c.verdict.separated and c.verdict is not Verdict.TOO_FEW]
+    if not few and not level:
+        others = "the other policy" if len(found) == 1 else f"all {len(found)} other policies"
+        return f"It is separated from {others}."
+    parts = []
+    if level:
+        parts.append(f"Not separated from it with these trials: {', '.join(level)}.")
+    if few:
+        unit = found[0].unit
+        parts.append(
+            f"No verdict on those that differ from it on fewer than {LEAST_DIFFERING} {unit}: "
+            f"{', '.join(few)}."
+        )
+    return " ".join(parts)

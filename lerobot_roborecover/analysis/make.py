@@ -1,0 +1,148 @@
+"""Trial logs in, a report out: the command's work, as a function."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_roborecover.analysis.gallery import check_scenarios, find_clips
+from lerobot_roborecover.analysis.headline import headline
+from lerobot_roborecover.analysis.logs import Study, read_study
+from lerobot_roborecover.analysis.named_path import split_named
+from lerobot_roborecover.analysis.panel import Panel
+from lerobot_roborecover.analysis.report import Extras, ReportFiles, write_report
+from lerobot_roborecover.analysis.results import Options, Results, analyse
+from lerobot_roborecover.analysis.tables import to_text
+
+
+@dataclass(frozen=True)
+class Report:
+    """A written report."""
+
+    results: Results
+    """The numbers."""
+    files: ReportFiles
+    """Where they are."""
+    remarks: tuple[str, ...]
+    """What a reader has to know about the pictures and the logs."""
+
+    def text(self) -> str:
+        """Its headline, the table of all policies, and where the files are."""
+        overall = to_text(next(table for table in self.files.tables if table.name == "overall"))
+        out = self.files.html.parent
+        return (
+            f"{headline(self.results)}\n\n{overall}\n\nreport    {self.files.html}\nmarkdown  "
+            f"{self.files.markdown}\ntables    {out / 'tables'}\nnumbers   {self.files.results}"
+        )
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """What a report's scenario gallery shows, beside outcomes."""
+
+    scenarios: str | None = None
+    """The evaluated set (shipped name, folder, Hub id): the logs are checked against it, and its recorded
+    frames are shown."""
+    revision: str | None = None
+    """Of that set on the Hub."""
+    render: bool = False
+    """Render recovery frames that the set does not hold; runs the simulator."""
+    videos: Sequence[str] = ()
+    """`DIR` or `NAME=DIR` with videos of `lerobot-eval`, NAME being the policy's."""
+    videos_mb: int = 64
+    """Take in at most so many megabytes of them."""
+
+
+def report(
+    logs: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
+    out: str | Path,
+    *,
+    platform: str | None = None,
+    title: str = "Recovery report",
+    options: Options | None = None,
+    gallery: Gallery | None = None,
+    command: str = "",
+) -> Report:
+    """Writes tables with intervals, figures and one HTML page, from trial logs.
+
+    Args:
+        logs: files, or folders that hold `trials.jsonl`; a mapping gives each policy's name in the report,
+            a text may be `NAME=LOG`.
+        out: folder of the report; made if need be, an earlier report in it is replaced.
+        platform: take this platform's rows only.
+        title: heading.
+        options: how intervals are drawn, and which policy is the baseline.
+        gallery: pictures of the scenarios.
+        command: what made the report, for its last lines.
+
+    Raises:
+        TrialLogError: a log cannot be read.
+        RowsError: the logs do not belong together.
+        ScenarioError: the gallery's scenarios cannot be loaded, or are not the logs'.
+    """
+    out, gallery = Path(out), gallery or Gallery()
+    study = read_study(_named(logs), platform)
+    with _no_garbage_yet():
+        results = analyse(study, options)
+    with _no_garbage_yet():
+        frames, clips, remarks = _pictures(gallery, out, study, results.recovery)
+        extras = Extras(frames, clips, tuple(remarks), title, command=command)
+        files = write_report(results, out, extras)
+    return Report(results, files, (*results.remarks, *remarks))
+
+
+@contextmanager
+def _no_garbage_yet() -> Iterator[None]:
+    """What is there now stays to the end: looking for garbage among millions of values takes long.
+
+    Afterwards the collector looks at everything again, since a report may be one of many in a process; what
+    the caller has frozen stays so.
+    """
+    ours = gc.get_freeze_count() == 0
+    if ours:
+        gc.freeze()
+    try:
+        yield
+    finally:
+        if ours:
+            gc.unfreeze()
+
+
+def _named(logs: str | Path | Sequence[str | Path] | Mapping[str, str | Path]) -> list[str]:
+    if isinstance(logs, Mapping):
+        return [f"{name}={path}" for name, path in logs.items()]
+    return [str(logs)] if isinstance(logs, str | Path) else [str(log) for log in logs]
+
+
+def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[dict, dict, list[str]]:
+    frames: dict[str, bytes] = {}
+    remarks: list[str] = []
+    ids = [s.id for s in panel.scenarios]
+    if gallery.scenarios:
+        from lerobot_roborecover.datasets import load_scenarios
+
+        chosen = load_scenarios(gallery.scenarios, revision=gallery.revision)
+        remarks += check_scenarios(study, tuple(chosen), gallery.scenarios)
+        wanted = [s for s in chosen if s.id in set(ids)]
+        frames = {
+            s.id: s.fingerprint.frames_png[-1] for s in wanted if s.fingerprint and s.fingerprint.frames_png
+        }
+        todo = [s for s in wanted if s.id not in frames]
+        if gallery.render and todo:
+            from lerobot_roborecover.analysis.pictures import render_frames
+
+            print(f"rendering {len(todo)} recovery frames ...", file=sys.stderr)
+            files, problem = render_frames(todo, out / "frames")
+            frames |= {i: path.read_bytes() for i, path in files.items()}
+            if problem:
+                remarks.append(f"pictures are missing: {problem}")
+    folders: list[tuple[str, Path]] = []
+    for text in gallery.videos:
+        name, rest = split_named(text)
+        folders.append((name, Path(rest)))
+    clips, skipped = find_clips(folders, ids, gallery.videos_mb * 2**20)
+    return frames, clips, remarks + skipped

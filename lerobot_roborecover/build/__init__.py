@@ -1,1 +1,0 @@
-"""How scenario sets are made: rollouts, drivers, labels, proofs; and the shipped sets themselves."""

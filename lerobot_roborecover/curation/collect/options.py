@@ -1,0 +1,100 @@
+"""What a collection is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_roborecover.curation.collect.exclusions import check_rules
+from lerobot_roborecover.curation.collect.experts import check_expert
+from lerobot_roborecover.curation.collect.judge import Judging
+from lerobot_roborecover.curation.collect.starts import (
+    Starts,
+)
+from lerobot_roborecover.curation.rollout import PERTURBED_STEPS
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.platforms import platform_named
+
+
+@dataclass(frozen=True)
+class CollectOptions:
+    """What to collect."""
+
+    platform: str
+    """Name of a registered platform."""
+    out: Path
+    """Folder of the candidate dataset; new."""
+    starts: Starts
+    tasks: tuple[str, ...]
+    """Patterns; see `choose_tasks`."""
+    policy: str = ""
+    """Folder or Hub id of a checkpoint; or else:"""
+    expert: str = ""
+    """Name of a scripted driver."""
+    name: str = ""
+    """Recorded name of whoever drives; by default the checkpoint's identity, or the expert's name."""
+    work: Path | None = None
+    """Working folder; by default beside `out`. Another collection from the same rollouts shares it."""
+    env: tuple[str, ...] = ()
+    """`name=value` of the recovery env type: what the policy sees."""
+    policy_options: tuple[str, ...] = ()
+    """`name=value` of the policy's config."""
+    rename_map: Mapping[str, str] = field(default_factory=dict)
+    device: str | None = None
+    perturb: bool = False
+    perturbed_steps: int = PERTURBED_STEPS
+    judging: Judging = field(default_factory=Judging)
+    seed: int = 7
+    """Of the perturbation, of the policy's noise, and of drivers that draw."""
+    horizon: int = 0
+    """Budget of each task in steps, of rollouts and of scenarios made from them; 0: the platform's."""
+    film_every: int = 1
+    """Steps from one picture to the next; the last one stands until then."""
+    frames: int = 256
+    """Side of the pictures in pixels; 0 films none."""
+    slots: int = 0
+    """Simulators at once; 0 takes one a core."""
+    max_batch: int = 1
+    """Slots that a policy is asked for at once. With 1 the result does not depend on their number."""
+    part_size: int = 20
+    watchdog_s: float = 600.0
+    retry_errors: bool = False
+    """Roll out again what broke in an earlier run."""
+    description: str = ""
+    license: str | None = None
+
+    def check(self) -> None:
+        """Checks what can be checked without a catalogue.
+
+        Raises:
+            OptionError, ScenarioError: naming the option, its value and what it may be.
+        """
+        if bool(self.policy) == bool(self.expert):
+            raise OptionError(
+                "who drives? Give either --policy.path=CHECKPOINT or --expert NAME"
+                + (", not both" if self.policy else "")
+            )
+        if self.expert:
+            check_expert(self.platform, self.expert)
+        for name, low, high in (
+            ("perturbed_steps", 1, 100_000), ("seed", 0, 2**32 - 1), ("slots", 0, 1024),
+            ("horizon", 0, 10_000), ("max_batch", 1, 4096), ("part_size", 1, 10_000),
+            ("watchdog_s", 1, 86_400),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                option = name.removesuffix("_s").replace("_", "-")
+                raise OptionError(f"--{option}={getattr(self, name)}: must be from {low} to {high}")
+        if not 1 <= self.film_every <= 1000:
+            raise OptionError(f"--film-every={self.film_every}: 1 to 1000 steps")
+        if self.frames and not 16 <= self.frames <= 2048:
+            raise OptionError(f"--frames={self.frames}: none, or a side of 16 to 2048 pixels")
+        own = platform_named(self.platform)
+        if self.perturb and not own.perturbable:
+            raise OptionError(f"--perturb: {own.why_not_perturbable}. Collect without it")
+        if self.judging.scene_touched_mm and not self.perturb:
+            raise OptionError("--scene-touched: what a disturbance touched can be asked with --perturb alone")
+        if self.judging.scene_touched_mm < 0:
+            raise OptionError(f"--scene-touched={self.judging.scene_touched_mm:g}: millimetres, above 0")
+        check_rules("--no-exclude", self.judging.skip)
+        check_rules("--exclude-only", self.judging.only)

@@ -1,0 +1,194 @@
+"""What is recorded of a rollout, and the simulator that records it while somebody else drives.
+
+The recorder stands between whoever drives and the simulator, in the simulator's own process, because that is
+where an action's perturbation can be tested for reach, step by step. A finished rollout is a file before the
+driver hears of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.curation.rollout import PERTURBED_STEPS, perturb_translations
+from lerobot_roborecover.platforms.limits import Workspace, limits_of
+from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.platforms.starts import stream
+from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
+from lerobot_roborecover.scenario import Pose, Reset, ScenarioError
+from lerobot_roborecover.whole import new_file
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """How rollouts are recorded; plain values, so that they travel to a worker."""
+
+    folder: str
+    """Where the records go."""
+    seed: int = 0
+    """Of the perturbation and of drivers that draw."""
+    expert: str = ""
+    """Name of the scripted driver; empty where a policy drives."""
+    perturbed_steps: int = PERTURBED_STEPS
+    """Leading interaction steps in which actions are perturbed."""
+
+
+@dataclass
+class Record:
+    """One rollout of T actions."""
+
+    reset: Reset
+    """With the fixtures' poses."""
+    actions: np.ndarray
+    """(T, A) float64, as executed."""
+    steps: Steps
+    margin_rad: np.ndarray
+    """(T + 1,) float64: distance of the arm's joints from their limits; NaN where nobody knows."""
+    workspace: Workspace | None
+    """Of the reset, where the simulator knows it."""
+    solved_after: int | None = field(init=False)
+    """Actions after which the task's predicate first held, or None."""
+
+    def __post_init__(self):
+        held = np.flatnonzero(self.steps.solved)
+        self.solved_after = int(held[0]) if len(held) else None
+
+
+def record_path(folder: str | os.PathLike[str], rollout_id: str) -> Path:
+    """File of a rollout's record."""
+    return Path(folder) / f"{rollout_id}.npz"
+
+
+def write_record(path: Path, record: Record) -> None:
+    """Writes a record, on disk when this returns."""
+    fixtures = {name: [*p.position_m, *p.quat_xyzw] for name, p in record.reset.fixtures.items()}
+    about = {
+        "schema": 1,
+        "bodies": list(record.steps.bodies),
+        "reset": {**asdict(replace(record.reset, fixtures={})), "fixtures": fixtures},
+        "workspace": None if record.workspace is None else asdict(record.workspace),
+    }
+    with new_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(
+            file,
+            about=np.array(json.dumps(about)),
+            actions=record.actions,
+            poses=np.stack(list(record.steps.bodies.values())),
+            solved=record.steps.solved,
+            perturbation=record.steps.perturbation,
+            margin_rad=record.margin_rad,
+        )
+
+
+def read_record(path: Path) -> Record:
+    """Reads what `write_record` wrote.
+
+    Raises:
+        ScenarioError: the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays["about"]))
+        reset = dict(about["reset"])
+        reset["fixtures"] = {n: Pose(tuple(v[:3]), tuple(v[3:])) for n, v in reset["fixtures"].items()}
+        place = about["workspace"]
+        return Record(
+            Reset(**reset),
+            arrays["actions"],
+            Steps(
+                dict(zip(about["bodies"], arrays["poses"], strict=True)),
+                arrays["solved"],
+                arrays["perturbation"],
+            ),
+            arrays["margin_rad"],
+            None
+            if place is None
+            else Workspace(tuple(place["low_m"]), tuple(place["high_m"]), place["support_m"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as err:
+        raise ScenarioError(
+            f"{path} is not a rollout's record ({err!s:.200}). Delete it: the same command rolls out again"
+        ) from None
+
+
+class RecordingSimulator:
+    """A simulator that records, and perturbs where the plan says so; everything else is the simulator's.
+
+    Args:
+        simulator: of any platform.
+        settings: where to, and the perturbation.
+    """
+
+    snapshot_is_exact = False
+    """A restored snapshot would leave steps unrecorded."""
+
+    def __init__(self, simulator: Simulator, settings: RecorderSettings):
+        self.inner = simulator
+        self._recorder = Recorder(simulator)
+        self._settings = settings
+        self._limits = limits_of(simulator)
+        self._plan: Planned | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "inner":  # while it is being made
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+    def plan(self, planned: Planned) -> None:
+        """Names the rollout that the next reset begins."""
+        self._plan = planned
+
+    def reset(self, task: Any, reset: Reset) -> None:
+        """Begins a record."""
+        assert self._plan is not None, "reset without a plan"
+        self._recorder.reset(task, reset)
+        self._noise = None
+        if self._plan.disturbed:
+            self._noise = stream(self._settings.seed, "perturbation", task, reset, self._plan.trial)
+        self._settling, self._last = reset.settle_steps, reset.settle_steps + task.horizon
+        self._margins = [self._margin_rad()]
+
+    def step(self, action: np.ndarray) -> None:
+        """Perturbs, executes in float64, records; writes the record with the last action."""
+        self._recorder.step(*self._disturbed(np.array(action, dtype=np.float64)))
+        self._margins.append(self._margin_rad())
+        if len(self._recorder) > self._settling and self.over:
+            self._write()
+
+    @property
+    def over(self) -> bool:
+        """Whether the task is solved or out of steps."""
+        return self._recorder.solved[-1] or len(self._recorder) >= self._last
+
+    def _disturbed(self, action: np.ndarray) -> tuple[np.ndarray, int]:
+        t = len(self._recorder) - self._settling
+        if self._noise is None or not 0 <= t < self._settings.perturbed_steps:
+            return action, UNPERTURBED
+        # Drawn whether or not it is executed: what comes later does not depend on reach.
+        noisy = perturb_translations(action, self._noise)
+        if self._limits is not None and not self._limits.reachable(noisy):
+            return action, UNREACHABLE
+        return noisy, PERTURBED
+
+    def _margin_rad(self) -> float:
+        return np.nan if self._limits is None else self._limits.joint_margin_rad()
+
+    def _write(self) -> None:
+        assert self._plan is not None
+        rollout = self._recorder.rollout
+        record = Record(
+            rollout.reset,
+            rollout.actions,
+            self._recorder.steps,
+            np.array(self._margins),
+            None if self._limits is None else self._limits.workspace(),
+        )
+        write_record(record_path(self._settings.folder, self._plan.record_name), record)

@@ -1,0 +1,147 @@
+"""The rollouts of a collection: experts in the workers, policies through the engine; every end is noted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.curation.collect.record import record_path
+from lerobot_roborecover.curation.collect.server import Driven
+from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.env.run import Run
+from lerobot_roborecover.env.trial import FAILURES
+from lerobot_roborecover.env.trial_log import Protocol, TrialRow
+from lerobot_roborecover.journal import Journal
+from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.trials.units import Unit, UnitQueue
+from lerobot_roborecover.workers.dispatch import each
+from lerobot_roborecover.workers.messages import SlotFailure
+from lerobot_roborecover.workers.slots import SlotPool
+
+ROLLOUTS_FILE = "rollouts.jsonl"
+RECORDS_FOLDER = "rollouts"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How one rollout ended."""
+
+    rollout: str
+    outcome: str
+    """A `scenario.Outcome`."""
+    steps: int
+    """Actions after settling."""
+    reason: str = ""
+    """Why, where it is neither success nor horizon."""
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it came to its end, so that there is a record."""
+        return Outcome(self.outcome).valid
+
+
+class RolloutBook:
+    """The journal of a working folder and the records beside it; one process at a time.
+
+    Args:
+        work: the folder.
+
+    Raises:
+        ScenarioError: the journal is damaged, or another process has it open.
+    """
+
+    def __init__(self, work: Path):
+        self.work, self.records = work, work / RECORDS_FOLDER
+        self._journal = Journal(work / ROLLOUTS_FILE, SCHEMA_VERSION)
+        self._ended: dict[str, Ended] = {}
+        for row in self._journal.records:
+            try:
+                ended = Ended(**{k: v for k, v in row.items() if k != "schema"})
+                Outcome(ended.outcome)
+            except (TypeError, ValueError) as err:
+                self._journal.close()
+                raise ScenarioError(
+                    f"{self._journal.path}: {row!r:.200} is not a rollout's end ({err})"
+                ) from None
+            self._ended[ended.rollout] = ended
+
+    def find(self, rollout: str, *, retry_errors: bool = False) -> Ended | None:
+        """How a rollout ended; None where it is still to be done.
+
+        Args:
+            rollout: its id.
+            retry_errors: one that broke is to be done again.
+        """
+        ended = self._ended.get(rollout)
+        if ended is None or (retry_errors and not ended.recorded):
+            return None
+        if ended.recorded and not record_path(self.records, rollout).is_file():
+            return None
+        return ended
+
+    def add(self, ended: Ended) -> None:
+        """Writes an end down."""
+        self._journal.append(asdict(ended))
+        self._ended[ended.rollout] = ended
+
+    def close(self) -> None:
+        """Lets go of the journal."""
+        self._journal.close()
+
+
+type OnEnd = Callable[[Ended], None]
+
+
+def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnEnd) -> None:
+    """Drives rollouts in the workers.
+
+    Args:
+        units: what to drive.
+        pool: of slots with `collect_server.SERVER` and settings that name the expert.
+        slots: how many.
+        on_end: told of each.
+    """
+    queue = UnitQueue(Unit(u, u.trial) for u in units)
+
+    def take(last: Unit | None, busy: list[Unit]) -> Unit | None:
+        return queue.take(last, [u.task for u in busy])
+
+    workers = pool.worker_slots(min(slots, max(len(queue), 1)))
+    for unit, reply in each(workers, "drive", take, lambda u: u.scenario):
+        name = unit.scenario.record_name
+        if isinstance(reply, SlotFailure):
+            on_end(Ended(name, FAILURES[reply.kind].value, 0, reply.message))
+        else:
+            assert isinstance(reply, Driven)
+            on_end(Ended(name, reply.outcome.value, reply.steps, reply.reason))
+
+
+def run_policy(
+    units: Sequence[Planned], pool: SlotPool, slots: int, host: Any, seed: int, on_end: OnEnd
+) -> None:
+    """Lets a policy drive, through the engine.
+
+    Args:
+        units: what to drive.
+        pool: of slots with `collect_server.SERVER`.
+        slots: how many.
+        host: the policy.
+        seed: of the run; a trial's noise comes from it and from the rollout's id.
+        on_end: told of each.
+    """
+    from lerobot_roborecover.trials.local import LocalEngine
+
+    if not units:
+        return
+    protocol = Protocol("recovery", 0, units[0].driver, seed, None)
+    run = Run(pool, protocol, None, "collect", None, handoff_check=False)
+    names = {u.id: u.record_name for u in units}
+
+    def told(row: TrialRow) -> None:
+        on_end(Ended(names[row.scenario_id], row.outcome, row.steps, row.reason))
+
+    engine = LocalEngine(run, host, slots=min(slots, len(units)), on_row=told)
+    engine.run([Unit(u, u.trial) for u in units])

@@ -1,0 +1,133 @@
+"""The slot server of a collection: records what a policy does, drives scripted experts, films by replay."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from lerobot_roborecover.curation.collect.experts import make_driver
+from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator
+from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.env.slot_server import SlotServer
+from lerobot_roborecover.platforms import Observation, Simulator
+from lerobot_roborecover.platforms.starts import stream
+from lerobot_roborecover.platforms.walk import advance, walk
+from lerobot_roborecover.scenario import Outcome, Rollout
+from lerobot_roborecover.workers.messages import EpisodeSpec, EpisodeStart, More, SlotConfig
+
+SERVER = f"{__name__}:CollectServer"
+REPLY_EVERY_S = 5.0
+"""How long a rollout or a film goes on before its slot gives a sign of life."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Reply to `drive`: how a scripted rollout ended."""
+
+    outcome: Outcome
+    steps: int
+    """Actions after settling."""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class FilmJob:
+    """A rollout to be replayed and looked at."""
+
+    rollout: Rollout
+    bodies: tuple[str, ...]
+    poses: np.ndarray
+    """(bodies, T + 1, 7) as recorded, to compare with."""
+    every: int = 1
+    """Looked at before each so many-th action; what was seen stands for those in between."""
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """Reply to `film`."""
+
+    observations: list[Observation]
+    """T raw observations, one before each action."""
+    error_m: float
+    """Largest distance of a body from where it was recorded, at any step."""
+
+
+class CollectServer(SlotServer):
+    """A slot that records; without settings it only films.
+
+    Args:
+        config: `settings` are those of `RecorderSettings`.
+    """
+
+    def __init__(self, config: SlotConfig):
+        super().__init__(config)
+        self._settings = RecorderSettings(**config.settings) if config.settings else None
+        self._recording: RecordingSimulator | None = None
+        self._under_way: Iterator[Driven | Filmed | None] = iter(())
+        if self._settings is not None:
+            self._recording = RecordingSimulator(self._simulator, self._settings)
+            self._simulator = cast(Simulator, self._recording)  # by delegation
+
+    def answer(self, command: str, argument: object = None) -> object:
+        """`drive` and `film` beside the usual commands."""
+        begin = {"drive": self._drive, "film": self._film}.get(command)
+        if begin is None:
+            return super().answer(command, argument)
+        if argument is not None:
+            self._under_way = begin(argument)
+        # A watchdog that counted a whole rollout would take a slow machine for a hung simulator.
+        began = time.monotonic()
+        for result in self._under_way:
+            if result is not None:
+                return result
+            if time.monotonic() - began > REPLY_EVERY_S:
+                break
+        return More()
+
+    def _reset(self, spec: EpisodeSpec) -> EpisodeStart:
+        if self._recording is not None:
+            assert isinstance(spec.scenario, Planned)
+            self._recording.plan(spec.scenario)
+        return super()._reset(spec)
+
+    def _drive(self, planned: Planned) -> Iterator[Driven | None]:
+        """A rollout; yields None after each step, and at last how it ended."""
+        assert self._recording is not None
+        assert self._settings is not None
+        simulator, task, reset = self._recording, planned.task, planned.reset
+        simulator.plan(planned)
+        simulator.reset(task, reset)
+        advance(simulator, planned.prefix)
+        if simulator.succeeded():
+            yield Driven(Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action")
+            return
+        rng = stream(self._settings.seed, "driver", task, reset, planned.trial)
+        act = make_driver(self._settings.expert, simulator.inner, task, rng)
+        for t in range(task.horizon):
+            action = np.asarray(act(t), dtype=np.float64)
+            if not np.isfinite(action).all():
+                yield Driven(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+                return
+            simulator.step(action)
+            if simulator.over:
+                solved = simulator.succeeded()
+                yield Driven(Outcome.SUCCESS if solved else Outcome.HORIZON, t + 1)
+                return
+            yield None
+
+    def _film(self, job: FilmJob) -> Iterator[Filmed | None]:
+        """A replay; yields None after each step, and at last what was seen."""
+        simulator, seen, error = self._simulator, [], 0.0
+        steps = len(job.rollout)
+        for t in walk(simulator, job.rollout):
+            now = simulator.bodies()
+            places = np.array([now[name].position_m for name in job.bodies])
+            error = max(error, float(np.linalg.norm(places - job.poses[:, t, :3], axis=1).max()))
+            if t < steps:
+                seen.append(simulator.observe() if t % job.every == 0 else seen[-1])
+            yield None
+        yield Filmed(seen, error)

@@ -1,0 +1,240 @@
+"""Writes the candidates of a collection: filmed by replay in the workers, in parts, joined at the end.
+
+A rollout is not rendered while it runs, unless its policy looks at pictures. What is kept is replayed
+afterwards, which is exact, and looked at before each action; a replay that is not where the rollout was is
+dropped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover import __version__
+from lerobot_roborecover.curation.attrition import Decision, record_decisions
+from lerobot_roborecover.curation.candidates import Candidate, read_candidates
+from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
+from lerobot_roborecover.curation.collect.judge import Verdict
+from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
+from lerobot_roborecover.curation.collect.server import Filmed, FilmJob
+from lerobot_roborecover.curation.film import Film
+from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.trajectory_write import Trajectory
+from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Rollout, ScenarioError
+from lerobot_roborecover.whole import new_folder, write_whole
+from lerobot_roborecover.workers.dispatch import failed, in_order
+from lerobot_roborecover.workers.slots import SlotPool
+
+COLLECT_FILE = "collect.json"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How a collection is written."""
+
+    records: Path
+    """Folder of the rollouts' records."""
+    parts: Path
+    """Folder of the parts."""
+    pool: SlotPool
+    """Slots that film, with `collect_server.SERVER`."""
+    slots: int
+    fps: int
+    versions: Mapping[str, str]
+    """Of the simulator."""
+    frames: str
+    """What is filmed; names the parts, so that another size is filmed anew."""
+    film: Film
+    """Kept with every candidate, so that what was seen can be rendered again."""
+    part_size: int = 20
+    """Candidates of a part: what is lost, at most, when the writing is stopped."""
+    description: str = ""
+    license: str | None = None
+
+
+def write_collection(
+    out: Path,
+    kept: Sequence[Verdict],
+    dropped: Iterable[Decision],
+    writing: Writing,
+    about: Mapping[str, Any],
+    on_film: Callable[[int], None] = lambda done: None,
+) -> Path:
+    """Films and writes what is kept; `out` appears as a whole, or not at all.
+
+    Args:
+        out: new or empty.
+        kept: candidates, in the order of their episodes.
+        dropped: decisions on all other rollouts.
+        writing: how.
+        about: content of `meta/roborecover/collect.json`.
+        on_film: told how many are written.
+
+    Raises:
+        ScenarioError: nothing could be written, or the folder is not new.
+    """
+    parts, lost, done = [], [], 0
+    size = writing.part_size
+    for first in range(0, len(kept), size):
+        chunk = kept[first : first + size]
+        part = writing.parts / _part_name(chunk, writing.frames)
+        if not part.is_dir():
+            with suppress(_NothingLeft):
+                _write_part(part, chunk, writing, lambda n, done=done: on_film(done + n))
+        there = set(read_candidates(part).by_id) if part.is_dir() else set()
+        notes = _read_lost(part)
+        lost += [
+            Decision(
+                v.planned.id, "collect", "dropped", *notes.get(v.planned.id, ("not filmed", "")), "replay"
+            )
+            for v in chunk
+            if v.planned.id not in there
+        ]
+        parts += [part] if there else []
+        done += len(chunk)
+        on_film(done)
+    if not parts:
+        raise ScenarioError(
+            f"none of the {len(kept)} candidates could be filmed, so {out} is not written. The first: "
+            f"{lost[0].reason}: {lost[0].detail}"
+        )
+    with new_folder(out) as whole:
+        merge_candidates(whole, parts)
+        record_decisions(whole, [*dropped, *lost])
+        document = {"schema_version": SCHEMA_VERSION, "written_by": {"lerobot_env_roborecover": __version__}}
+        text = json.dumps({**document, **about}, indent=2, allow_nan=False)
+        (whole / FOLDER / COLLECT_FILE).write_text(text + "\n", encoding="utf-8")
+    return out
+
+
+def read_about(out: Path) -> dict[str, Any] | None:
+    """What `collect.json` of a finished collection says; None where there is none.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    path = out / FOLDER / COLLECT_FILE
+    try:
+        found = json.loads(path.read_bytes())
+        if not isinstance(found, dict) or found.get("schema_version") != SCHEMA_VERSION:
+            raise ValueError("of another version")
+        return found
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as err:
+        raise ScenarioError(f"{path} cannot be read ({err!s:.200}). Give another --out") from None
+
+
+class _NothingLeft(Exception):
+    """No rollout of a part could be filmed."""
+
+
+def _write_part(
+    part: Path, chunk: Sequence[Verdict], writing: Writing, on_film: Callable[[int], None]
+) -> None:
+    lost: dict[str, tuple[str, str]] = {}
+    films = _films(chunk, writing, lost)
+    first = next(films, None)
+    _write_lost(part, lost)
+    if first is None:
+        raise _NothingLeft
+
+    def draw() -> Iterator[Recording]:
+        count = 0
+        recording: Recording | None = first
+        while recording is not None:
+            yield recording
+            count += 1
+            on_film(count + len(lost))
+            recording = next(films, None)
+            _write_lost(part, lost)
+
+    write_candidates(
+        part,
+        draw(),
+        fps=writing.fps,
+        versions=writing.versions,
+        description=writing.description,
+        license=writing.license,
+    )
+
+
+def _films(
+    chunk: Sequence[Verdict], writing: Writing, lost: dict[str, tuple[str, str]]
+) -> Iterator[Recording]:
+    """Recordings of a part, as they are filmed; notes those that are lost, and why."""
+
+    def job(v: Verdict) -> FilmJob:
+        record = read_record(record_path(writing.records, v.planned.id))
+        poses = record.steps.bodies
+
+        return FilmJob(
+            Rollout(v.planned.task, record.reset, record.actions),
+            tuple(poses),
+            np.stack(list(poses.values())),
+            writing.film.every,
+        )
+
+    workers = writing.pool.worker_slots(min(writing.slots, len(chunk)))
+    for v, film in zip(chunk, in_order(workers, "film", chunk, job), strict=True):
+        if failed(film):
+            lost[v.planned.id] = "could not be replayed", failed(film)[:500]
+            continue
+        assert isinstance(film, Filmed)
+        if film.error_m > HANDOFF_TOLERANCE_M:
+            lost[v.planned.id] = (
+                "its replay is another rollout",
+                f"up to {1e3 * film.error_m:.2f} mm apart (limit {1e3 * HANDOFF_TOLERANCE_M:g} mm)",
+            )
+            continue
+        record = read_record(record_path(writing.records, v.planned.id))
+        yield _recording(v, record, film, writing.film)
+
+
+def _recording(v: Verdict, record: Record, film: Filmed, filmed: Film) -> Recording:
+    from lerobot_roborecover.datasets.episodes import to_frame
+
+    planned = v.planned
+    return Recording(
+        Candidate(planned.id, planned.source),
+        Trajectory(
+            task=planned.task,
+            driver=planned.driver,
+            actions=record.actions,
+            frames=(to_frame(planned.platform, o) for o in film.observations),
+            success=False,
+            reset=record.reset,
+            provenance={"collect": {**(v.notes or {}), "film": filmed.note()}},
+        ),
+        record.steps,
+        *((v.exclusion.reason, v.exclusion.detail, f"rule {v.exclusion.rule}") if v.exclusion else ()),
+    )
+
+
+def _part_name(chunk: Sequence[Verdict], frames: str) -> str:
+    """By what is in it, so that a part of other candidates, notes or pictures is another part."""
+    text = [frames, [[v.planned.id, v.notes, v.exclusion and vars(v.exclusion)] for v in chunk]]
+    return hashlib.sha256(json.dumps(text, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def _lost_path(part: Path) -> Path:
+    return part.with_name(f"{part.name}.lost.json")
+
+
+def _write_lost(part: Path, lost: Mapping[str, tuple[str, str]]) -> None:
+    write_whole(_lost_path(part), json.dumps(lost))
+
+
+def _read_lost(part: Path) -> dict[str, tuple[str, str]]:
+    try:
+        return {k: (str(a), str(b)) for k, (a, b) in json.loads(_lost_path(part).read_text()).items()}
+    except (OSError, ValueError, AttributeError):
+        return {}

@@ -1,0 +1,332 @@
+"""Donors: other policies' recoveries where the base policy fails, to train Correction on.
+
+As the paper has it ("Setup" of the interventions; appendix, "Correction Data and Training"):
+
+1. of the training scenarios, those that the base recovers in less than 40 % of its trials;
+2. the alternatives that recover one in more than 60 % of theirs are its candidates;
+3. four trials each; a candidate stays with at least three successes and every trial complete;
+4. one trajectory per source record: the best candidate's first success;
+5. it is replayed, must succeed again, and its observations are rendered as it goes.
+
+What falls out on the way is counted with its reason.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.curation.monitor_data.frames import Film, Job, replayed
+from lerobot_roborecover.curation.policy_trials import PolicyTrial
+from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
+from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
+
+
+@dataclass(frozen=True)
+class DonorOptions:
+    """Thresholds; the defaults are the paper's."""
+
+    base_below: float = 0.4
+    """The base's recovery rate on a scenario must be below this."""
+    donor_above: float = 0.6
+    """An alternative's must be above this."""
+    trials: int = 4
+    """Of each candidate."""
+    successes: int = 3
+    """Of these, at least."""
+    per_record: int = 1
+    """Different trajectories kept of one source record, at most."""
+
+    def __post_init__(self):
+        if not 0.0 <= self.base_below <= 1.0 or not 0.0 <= self.donor_above < 1.0:
+            raise ScenarioError(
+                f"base below {self.base_below} and donors above {self.donor_above}: rates are from 0 to 1"
+            )
+        if not 1 <= self.successes <= self.trials or self.per_record < 1:
+            raise ScenarioError(
+                f"{self.successes} successes of {self.trials} trials, {self.per_record} per record: must be "
+                "at least 1, and no more successes than trials"
+            )
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An alternative on a scenario that the base does badly on."""
+
+    scenario: Scenario
+    policy: str
+    """As in the trial logs."""
+    base_rate: float
+    donor_rate: float
+    """Of the selection's trials."""
+
+
+@dataclass(frozen=True)
+class Donor:
+    """A candidate that passed its four trials."""
+
+    candidate: Candidate
+    trials: tuple[PolicyTrial, ...]
+    """All of them, by index."""
+
+    @property
+    def successes(self) -> list[PolicyTrial]:
+        """Those that succeeded."""
+        return [t for t in self.trials if t.row.success]
+
+
+@dataclass
+class Funnel:
+    """How many were left after each step, and why the others were not."""
+
+    steps: list[tuple[str, int, Counter]]
+
+    @classmethod
+    def begin(cls, what: str, count: int) -> Funnel:
+        """A funnel that starts with so many."""
+        return cls([(what, count, Counter())])
+
+    def add(self, what: str, count: int, dropped: Counter | None = None) -> None:
+        """A further step: what is left, and what was dropped on the way."""
+        self.steps.append((what, count, dropped or Counter()))
+
+    def table(self) -> str:
+        """In plain text."""
+        lines = []
+        for what, count, dropped in self.steps:
+            lines += [f"{'':8}- {n} {reason}" for reason, n in dropped.most_common()]
+            lines.append(f"{count:6}  {what}")
+        return "\n".join(lines)
+
+    def record(self) -> list[dict[str, Any]]:
+        """As JSON-able records."""
+        return [{"step": w, "count": n, "dropped": dict(d)} for w, n, d in self.steps]
+
+
+def choose_candidates(
+    scenarios: Iterable[Scenario],
+    rows: Iterable[TrialRow],
+    base: str,
+    options: DonorOptions,
+    funnel: Funnel,
+) -> list[Candidate]:
+    """Scenarios and alternatives whose rates call for a donor.
+
+    Args:
+        scenarios: of the training split.
+        rows: trials of the base and of the alternatives; only those from the recovery point, on these
+            scenarios, are read. An invalid trial counts as a failure.
+        base: the base policy, as its rows name it.
+        options: thresholds.
+        funnel: told.
+
+    Raises:
+        ScenarioError: no row is of the base.
+    """
+    by_hash = {s.sha256(): s for s in scenarios}
+    results: dict[str, dict[str, list[bool]]] = defaultdict(lambda: defaultdict(list))
+    policies: Counter[str] = Counter()
+    for row in rows:
+        if row.start == Start.RECOVERY.value and not row.interventions:
+            policies[row.policy] += 1
+            if row.scenario_sha256 in by_hash:
+                results[row.scenario_sha256][row.policy].append(row.success)
+    if base not in policies:
+        raise ScenarioError(
+            f"no trial from the recovery point is by {base!r}; the logs have {sorted(policies)}. Name one of "
+            "them with --base"
+        )
+    dropped: Counter = Counter()
+    found: list[Candidate] = []
+    for sha, scenario in by_hash.items():
+        rates = {policy: float(np.mean(done)) for policy, done in results[sha].items()}
+        if scenario.split == "test":
+            dropped["of the test split, which must not train anything"] += 1
+        elif base not in rates:
+            dropped["without a trial of the base"] += 1
+        elif rates[base] >= options.base_below:
+            dropped[f"recovered by the base in {options.base_below:.0%} or more"] += 1
+        else:
+            able = [p for p in sorted(rates) if p != base and rates[p] > options.donor_above]
+            if not able:
+                dropped[f"recovered by no alternative in more than {options.donor_above:.0%}"] += 1
+            found += [Candidate(scenario, p, rates[base], rates[p]) for p in able]
+    funnel.add("scenarios with an alternative that does better", len({c.scenario.id for c in found}), dropped)
+    funnel.add("candidates: such a scenario and one alternative", len(found))
+    return found
+
+
+def judge(
+    candidates: Iterable[Candidate], trials: Iterable[PolicyTrial], options: DonorOptions, funnel: Funnel
+) -> list[Donor]:
+    """Candidates whose trials are complete and mostly succeed.
+
+    Args:
+        candidates: from `choose_candidates`.
+        trials: of the candidates' policies, with actions; others are ignored.
+        options: thresholds.
+        funnel: told.
+    """
+    of: dict[tuple[str, str], dict[int, PolicyTrial]] = defaultdict(dict)
+    for trial in trials:
+        if trial.row.start == Start.RECOVERY.value and not trial.row.interventions:
+            of[trial.row.scenario_sha256, trial.row.policy].setdefault(trial.row.trial, trial)
+    donors, dropped = [], Counter()
+    for candidate in candidates:
+        mine = of[candidate.scenario.sha256(), candidate.policy]
+        four = [mine[k] for k in sorted(mine)[: options.trials]]
+        complete = [t for t in four if Outcome(t.row.outcome).valid]
+        donor = Donor(candidate, tuple(four))
+        if len(four) < options.trials:
+            dropped[f"with fewer than {options.trials} trials"] += 1
+        elif len(complete) < options.trials:
+            dropped["with a trial that did not complete"] += 1
+        elif len(donor.successes) < options.successes:
+            dropped[f"with fewer than {options.successes} successes in {options.trials}"] += 1
+        else:
+            donors.append(donor)
+    what = f"donors: {options.successes} of {options.trials} trials succeed, all complete"
+    funnel.add(what, len(donors), dropped)
+    return donors
+
+
+def source_record(scenario: Scenario) -> str:
+    """What a scenario was made from: the trajectory it shares with the others of its cluster."""
+    return scenario.cluster or scenario.id
+
+
+def deduplicate(
+    donors: Iterable[Donor], options: DonorOptions, funnel: Funnel
+) -> list[tuple[Donor, PolicyTrial]]:
+    """At most `per_record` trajectories of each source record, none of them twice.
+
+    The donor with the most successes goes first, then the one with the better rate, then the quicker one.
+    """
+    by_record: dict[str, list[Donor]] = defaultdict(list)
+    for donor in donors:
+        by_record[source_record(donor.candidate.scenario)].append(donor)
+    kept, dropped = [], Counter()
+    for record in sorted(by_record):
+        group = sorted(by_record[record], key=_preference)
+        seen: set[str] = set()
+        for donor in group:
+            fresh = [t for t in donor.successes if t.row.actions_sha256 not in seen]
+            taken: list[PolicyTrial] = []
+            for trial in fresh:
+                if len(seen) < options.per_record and trial.row.actions_sha256 not in seen:
+                    seen.add(trial.row.actions_sha256)
+                    taken.append(trial)
+            if not taken:
+                dropped["of a source record that has its trajectory already"] += 1
+            kept += [(donor, trial) for trial in taken]
+    funnel.add("trajectories", len(kept), dropped)
+    return kept
+
+
+def _preference(donor: Donor) -> tuple:
+    c, won = donor.candidate, donor.successes
+    return (-len(won), -c.donor_rate, float(np.mean([t.row.steps for t in won])), c.policy, c.scenario.id)
+
+
+def write_donors(
+    root: Path,
+    chosen: Sequence[tuple[Donor, PolicyTrial]],
+    *,
+    simulator: Mapping[str, Any],
+    workers: int,
+    funnel: Funnel,
+    description: str = "",
+    license: str | None = None,
+    on_trajectory: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Replays, checks and writes the trajectories; how many were written.
+
+    Args:
+        root: the dataset's folder; must be new or empty.
+        chosen: from `deduplicate`.
+        simulator: its options, which decide the observations.
+        workers: processes that replay.
+        funnel: told, and described in the dataset's manifest.
+        description: free text.
+        license: SPDX identifier, or None where none is decided.
+        on_trajectory: told how many are done of how many.
+
+    Raises:
+        ScenarioError: there is nothing to write.
+    """
+    from lerobot_roborecover.datasets.episodes import to_frame
+    from lerobot_roborecover.platforms import make_simulator
+
+    if not chosen:
+        raise ScenarioError(
+            f"no trajectory is left for {root}:\n{funnel.table()}\nRun more alternatives, or more scenarios"
+        )
+    dropped: Counter = Counter()
+    platform = chosen[0][0].candidate.scenario.platform
+    probe = make_simulator(platform, **simulator)
+    fps = round(probe.control_hz)
+    probe.close()
+
+    def trajectories() -> Iterator[Trajectory]:
+        jobs = [_job(donor, trial) for donor, trial in chosen]
+        films = zip(chosen, replayed(jobs, simulator, workers), strict=True)
+        for number, ((donor, trial), film) in enumerate(films, 1):
+            problem = _problem(film, trial)
+            if problem:
+                dropped[problem] += 1
+            else:
+                frames = [to_frame(platform, o) for o in film.observations]
+                yield _trajectory(donor, trial, frames)
+            on_trajectory(number, len(chosen))
+
+    write_trajectories(root, "donors", trajectories(), fps=fps, description=description, license=license)
+    written = len(chosen) - dropped.total()
+    funnel.add("trajectories that succeed again when replayed", written, dropped)
+    return written
+
+
+def _job(donor: Donor, trial: PolicyTrial) -> Job:
+    t = len(donor.candidate.scenario.prefix)
+    return Job(donor.candidate.scenario, trial.actions, np.arange(t, t + len(trial.actions)))
+
+
+def _problem(film: Film, trial: PolicyTrial) -> str:
+    if not film.succeeded:
+        return "whose replay does not succeed"
+    if len(film.observations) != len(trial.actions):
+        return "whose replay ends early"
+    return ""
+
+
+def _trajectory(donor: Donor, trial: PolicyTrial, frames: list) -> Trajectory:
+    candidate = donor.candidate
+    scenario = candidate.scenario
+    return Trajectory(
+        task=scenario.task,
+        driver=candidate.policy,
+        actions=trial.actions.astype(np.float64),
+        frames=frames,
+        success=True,
+        scenario=scenario,
+        first_step=len(scenario.prefix),
+        trial=trial.row.trial,
+        provenance={
+            "source_record": source_record(scenario),
+            "trials": len(donor.trials),
+            "successes": len(donor.successes),
+            "base_rate": candidate.base_rate,
+            "donor_rate": candidate.donor_rate,
+            "actions_dtype": str(trial.actions.dtype),
+        },
+    )
+
+
+def describe(options: DonorOptions, base: str, funnel: Funnel) -> dict[str, Any]:
+    """What the dataset's `donors.json` says."""
+    return {"base": base, "options": asdict(options), "funnel": funnel.record()}

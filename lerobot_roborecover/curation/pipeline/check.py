@@ -1,0 +1,246 @@
+"""Everything of a build that can be refused, before its first stage runs.
+
+A build takes hours, and its last stage should not be the one to find that a number was mistyped. All problems
+are reported together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.curation.annotation.votes import check_name
+from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.pipeline.commands import COMMANDS, Places, annotate_command, collect_command
+from lerobot_roborecover.curation.pipeline.config import ChainConfig
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.scenario import ScenarioError
+
+type Parse = Callable[[list[str]], argparse.Namespace]
+"""Parses and checks `roborecover ARGV`; raises OptionError or ScenarioError."""
+
+_REPO = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_SIZE = 256
+"""Side of the pictures that `collect` takes by default, pixels."""
+
+
+@dataclass
+class _Problems:
+    found: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def of(self, where: str) -> Iterator[None]:
+        """Notes a refusal of the block under its place in the file."""
+        said = io.StringIO()
+        try:
+            with redirect_stderr(said):
+                yield
+        except (OptionError, ScenarioError) as err:
+            self.found.append(f"{where}: {' '.join(str(err).split())}")
+        except SystemExit:  # a parser's way to refuse, after its usage
+            *_, last = said.getvalue().strip().splitlines() or ["an option is not one"]
+            self.found.append(f"{where}: {last.partition('error: ')[2] or last}")
+
+
+def check_build(config: ChainConfig, parse: Parse) -> list[str]:
+    """What stands against a build.
+
+    Args:
+        config: the whole file.
+        parse: takes a stage's command apart and checks its options.
+
+    Returns:
+        Problems, one a line, each with its place in the file; empty where there are none.
+    """
+    problems, places = _Problems(), Places(config)
+    _check_folders(problems, places)
+    for name, part in config.collect.items():
+        where = f"collect.{name}"
+        with problems.of(where):
+            if part.dataset:
+                _check_dataset(Path(part.dataset), config.platform)
+            else:
+                parse(collect_command(config, name, part, places.collected(name)))
+        if part.policy:
+            with problems.of(f"{where}.policy"):
+                check_checkpoint(part.policy, part.policy_options)
+    with problems.of("collect"):
+        _check_sizes(config)
+    with problems.of("annotate"):
+        parse(annotate_command(config, places))
+        _check_votes(places.votes, named=bool(config.annotate.votes))
+    parsed: dict[str, argparse.Namespace] = {}
+    for name, command in COMMANDS.items():
+        if getattr(config, name, "agree") is not None:
+            with problems.of(name):
+                parsed[name] = parse(command(config, places))
+    if "screen" in parsed:
+        _check_screen(problems, config, parsed["screen"])
+    if "validate" in parsed:
+        _check_validate(problems, config, parsed["validate"])
+    if "split" in parsed:
+        _check_split(problems, parsed["split"])
+    if config.render is not None:
+        with problems.of("render"):
+            from lerobot_roborecover.curation.render import SIZE, check_size
+
+            check_size(config.render.frames or SIZE)
+            _check_env(config.platform, [f"{k}={v}" for k, v in config.render.env.items()])
+    if config.publish is not None:
+        with problems.of("publish"):
+            _check_publish(config)
+    return problems.found
+
+
+def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
+    """Checks that a policy exists and can be loaded, without holding its weights in memory.
+
+    Args:
+        path: folder or Hub id.
+        options: of its config.
+
+    Raises:
+        OptionError: it cannot; says why.
+    """
+    from lerobot.policies import get_policy_class
+    from safetensors import SafetensorError, safe_open
+
+    from lerobot_roborecover.curation.pipeline.commands import text
+    from lerobot_roborecover.trials.load import policy_config
+
+    try:
+        config = policy_config(path, [f"{k}={text(v)}" for k, v in options.items()])
+        get_policy_class(config.type)
+    except (OptionError, ScenarioError):
+        raise
+    except Exception as err:  # draccus, LeRobot and what a policy imports raise types of their own
+        raise OptionError(f"{path} cannot be loaded: {type(err).__name__}: {err!s:.300}") from None
+    for file in sorted(Path(path).glob("*.safetensors")):
+        try:
+            with safe_open(file, "pt") as weights:
+                weights.keys()
+        except (SafetensorError, OSError) as err:
+            raise OptionError(f"{file} cannot be read: {err}; copy or train the checkpoint again") from None
+
+
+def _check_folders(problems: _Problems, places: Places) -> None:
+    with problems.of("out"):
+        root = places.root
+        there = next(p for p in (root, *root.absolute().parents) if p.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+            raise ScenarioError(f"{root} cannot be written: {there} is no folder that you may write to")
+        results = (
+            "candidates", "scenarios", "screened", "validated", "split", "rendered", "summary", "old"
+        )  # fmt: skip
+        for path in (getattr(places, name) for name in results):
+            if path.exists() and not path.is_dir():
+                raise ScenarioError(f"{path} is a file, and a stage's folder belongs there; move it away")
+
+
+def _check_dataset(dataset: Path, platform: str) -> None:
+    found = read_candidates(dataset)
+    if found.platform != platform:
+        raise ScenarioError(f"{dataset} is of {found.platform}, this build of {platform}")
+
+
+def _check_sizes(config: ChainConfig) -> None:
+    """Candidates are joined without encoding anything again, so that all pictures are of one size."""
+    sizes: dict[str, set[tuple[int, int]]] = {}
+    for name, part in config.collect.items():
+        if part.dataset:
+            sizes[name] = _filmed(Path(part.dataset))
+        elif str(part.frames or _SIZE) == "none":
+            raise OptionError(f"collect.{name}.frames: none; annotators need something to look at")
+        elif platform_named(config.platform).sizes_pictures and str(part.frames or _SIZE).isdigit():
+            side = int(part.frames or _SIZE)
+            if side % 2:
+                raise OptionError(f"collect.{name}.frames: {side}; video has an even side, e.g. {side + 1}")
+            sizes[name] = {(side, side)}
+    if len({frozenset(found) for found in sizes.values() if found}) > 1:
+        said = ", ".join(
+            f"{name} {' and '.join(f'{w} x {h}' for h, w in sorted(found))}" for name, found in sizes.items()
+        )
+        raise OptionError(f"frame sizes differ ({said}), and candidates of one build share one; set frames")
+
+
+def _filmed(dataset: Path) -> set[tuple[int, int]]:
+    """Height and width of a dataset's videos; nothing where that cannot be told."""
+    try:
+        features = json.loads((dataset / "meta" / "info.json").read_bytes())["features"].values()
+        return {tuple(f["shape"][:2]) for f in features if f["dtype"] == "video"}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return set()  # reading the dataset says what is wrong with it
+
+
+def _check_votes(folder: Path, *, named: bool) -> None:
+    if named and folder.exists() and not folder.is_dir():
+        raise ScenarioError(f"votes {folder} is a file; name the folder of the annotators' journals")
+    for path in sorted(folder.glob("*.jsonl")):
+        check_name(path.stem)
+
+
+def _check_screen(problems: _Problems, config: ChainConfig, args: argparse.Namespace) -> None:
+    from lerobot_roborecover.curation.screen.runs import check_policies, parse_policies
+    from lerobot_roborecover.curation.screen.screening import ScreenRule
+
+    with problems.of("screen.keep"):
+        ScreenRule(args.trials, tuple(args.keep), args.max_invalid).check(len(config.screen.policies))
+    with problems.of("screen"):
+        specs, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
+        check_policies(specs)
+        for one in [[], *(spec.env for spec in specs)]:
+            _check_env(config.platform, [*env, *one])
+    for number, policy in enumerate(config.screen.policies):
+        with problems.of(f"screen.policies.{number}"):
+            check_checkpoint(policy.path, policy.options)
+
+
+def _check_env(platform: str, options: Sequence[str]) -> None:
+    """Checks options of the recovery env type."""
+    import draccus
+
+    from lerobot_roborecover.curation.policy_trials import env_config
+
+    try:
+        env_config(platform, "none", [f"--{o.removeprefix('--')}" for o in options])
+    except (draccus.utils.DraccusException, ValueError, TypeError) as err:
+        raise OptionError(f"env: {' '.join(str(err).split())}") from None
+
+
+def _check_validate(problems: _Problems, config: ChainConfig, args: argparse.Namespace) -> None:
+    from lerobot_roborecover.curation.validate.validation import ValidationRule
+
+    with problems.of("validate"):
+        ValidationRule(args.runs, args.seed, args.tolerance_mm, args.min_ssim)
+        _check_env(config.platform, args.env)
+        if args.rejects is not None and not args.rejects.is_file():
+            raise OptionError(f"rejects {args.rejects} is not there")
+
+
+def _check_split(problems: _Problems, args: argparse.Namespace) -> None:
+    from lerobot_roborecover.curation.split import parse_apart, parse_sizes
+
+    with problems.of("split"):
+        parse_sizes(dict(pair.split("=", 1) for pair in args.others))
+        parse_apart(args.apart)
+
+
+def _check_publish(config: ChainConfig) -> None:
+    from lerobot_roborecover.datasets.card import license_metadata
+    from lerobot_roborecover.datasets.publish import check_version
+
+    assert config.publish is not None
+    if not _REPO.fullmatch(config.publish.repo_id):
+        raise OptionError(f"repo_id {config.publish.repo_id!r:.80} is not like ORG/NAME")
+    check_version(config.publish.version or "1.0.0")
+    if any(part.dataset is None for part in config.collect.values()):
+        license_metadata(config.license)

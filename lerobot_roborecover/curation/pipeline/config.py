@@ -1,0 +1,263 @@
+"""The YAML file of `roborecover build`: the options of every stage, in the words of its command.
+
+An option that is left out is the command's default. Unknown keys are refused, with what is near.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.datasets.licenses import license_metadata
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.platforms import platform_names
+from lerobot_roborecover.scenario import ScenarioError
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass
+class CollectPart:
+    """One way in which rollouts come about: options of `roborecover collect`, or a dataset that is there."""
+
+    dataset: str | None = None
+    """A candidate dataset, e.g. of `roborecover teleop`; then nothing else is given."""
+    policy: str | None = None
+    """Folder or Hub id of a checkpoint."""
+    expert: str | None = None
+    """Or a scripted driver."""
+    name: str | None = None
+    task: list[str] = field(default_factory=list)
+    seeds: str | int | None = None
+    init_states: str | int | None = None
+    draw: int | None = None
+    seed: int | None = None
+    reset_seed: int | None = None
+    trials: int | None = None
+    horizon: int | None = None
+    perturb: bool | None = None
+    perturb_steps: int | None = None
+    scene_touched: float | None = None
+    frames: str | int | None = None
+    film_every: int | None = None
+    no_exclude: list[str] = field(default_factory=list)
+    exclude_only: list[str] = field(default_factory=list)
+    slots: int | None = None
+    max_batch: int | None = None
+    device: str | None = None
+    watchdog: float | None = None
+    retry_errors: bool | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+    policy_options: dict[str, Any] = field(default_factory=dict)
+    rename_map: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class AnnotatePart:
+    """Options of `roborecover annotate` and `agree`."""
+
+    votes: str | None = None
+    """Folder of votes that are there already; by default `OUT/votes`."""
+    automatic: bool = False
+    """Programs annotate; their labels are marked as automatic."""
+    votes_needed: int = 3
+    tolerance: int = 10
+    no_consensus: str = "drop"
+    """`drop`, or `discuss`: stop until a further round has settled them."""
+
+
+@dataclass
+class PolicyPart:
+    """A screening policy."""
+
+    path: str = ""
+    name: str | None = None
+    deterministic: bool = False
+    """It does the same in every trial: one is run of each scenario, and counts as all."""
+    options: dict[str, Any] = field(default_factory=dict)
+    env: dict[str, Any] = field(default_factory=dict)
+    rename_map: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class ScreenPart:
+    """Options of `roborecover screen`."""
+
+    policies: list[PolicyPart] = field(default_factory=list)
+    trials: int | None = None
+    keep: list[Any] | None = None
+    max_invalid: int | None = None
+    run_seed: int | None = None
+    device: str | None = None
+    slots: int | None = None
+    max_batch: int | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class ValidatePart:
+    """Options of `roborecover validate`."""
+
+    runs: int | None = None
+    seed: int | None = None
+    tolerance_mm: float | None = None
+    min_ssim: float | None = None
+    no_frames: bool | None = None
+    no_outcomes: bool | None = None
+    rejects: str | None = None
+    workers: int | None = None
+    limit_s: float | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class SplitPart:
+    """Options of `roborecover split`."""
+
+    sizes: dict[str, float] = field(default_factory=dict)
+    """By split: counts, or fractions."""
+    seed: int | None = None
+    apart: str | None = None
+
+
+@dataclass
+class RenderPart:
+    """Options of `roborecover render`."""
+
+    frames: int | None = None
+    workers: int | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class PublishPart:
+    """Options of `roborecover publish`."""
+
+    repo_id: str = ""
+    version: str | None = None
+    private: bool | None = None
+    title: str | None = None
+    no_pictures: bool | None = None
+    anonymise: bool | None = None
+
+
+@dataclass
+class ChainConfig:
+    """The whole file."""
+
+    out: str = ""
+    """Folder of everything that is made."""
+    platform: str = ""
+    collect: dict[str, CollectPart] = field(default_factory=dict)
+    """By a name of its own each."""
+    annotate: AnnotatePart = field(default_factory=AnnotatePart)
+    screen: ScreenPart = field(default_factory=ScreenPart)
+    validate: ValidatePart = field(default_factory=ValidatePart)
+    split: SplitPart = field(default_factory=SplitPart)
+    render: RenderPart | None = field(default_factory=RenderPart)
+    """None (`render: null`) ends with the splits, without episodes."""
+    publish: PublishPart | None = None
+    """None prints the command."""
+    license: str | None = None
+    """SPDX identifier; none is assumed."""
+
+
+def read_config(path: Path) -> ChainConfig:
+    """Reads and checks a file.
+
+    Raises:
+        OptionError: names the file, the key and what it may be.
+    """
+    import draccus
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as err:
+        raise OptionError(f"{path} cannot be read: {err}") from None
+    except yaml.YAMLError as err:
+        raise OptionError(f"{path} is not YAML: {' '.join(str(err).split())}") from None
+    if not isinstance(content, dict):
+        raise OptionError(f"{path} holds a {type(content).__name__}, not a map of options")
+    try:
+        check_keys(ChainConfig, content, "")
+        config = draccus.decode(ChainConfig, content)
+        _check(config)
+    except OptionError as err:
+        raise OptionError(f"{path}: {err}") from None
+    except (draccus.utils.DecodingError, draccus.utils.ParsingError, ValueError, TypeError) as err:
+        raise OptionError(f"{path}: {' '.join(str(err).split())}") from None
+    return config
+
+
+def check_keys(kind: Any, content: Any, where: str) -> None:
+    """Refuses keys that a dataclass does not have, at any depth.
+
+    Raises:
+        OptionError: names the key, and what is near or there.
+    """
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(content, dict):
+        hints = typing.get_type_hints(kind)
+        for key, value in content.items():
+            if key not in hints:
+                near = difflib.get_close_matches(str(key), hints, n=3, cutoff=0.6)
+                meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(hints)}"
+                raise OptionError(f"unknown key {where}{key}; {meant}")
+            check_keys(hints[key], value, f"{where}{key}.")
+    elif origin is dict and isinstance(content, dict):
+        for key, value in content.items():
+            check_keys(inner[1], value, f"{where}{key}.")
+    elif origin is list and isinstance(content, list):
+        for number, value in enumerate(content):
+            check_keys(inner[0], value, f"{where}{number}.")
+    elif inner:  # a union: of a dataclass and None, at most
+        for option in inner:
+            if dataclasses.is_dataclass(option):
+                check_keys(option, content, where)
+
+
+def _check(config: ChainConfig) -> None:
+    if not config.out:
+        raise OptionError("out is missing: the folder of everything that is made")
+    if config.platform not in platform_names():
+        raise OptionError(f"platform {config.platform!r} is not one of {', '.join(platform_names())}")
+    if not config.collect:
+        raise OptionError("collect is empty: name at least one way in which rollouts come about")
+    for name, part in config.collect.items():
+        if not _NAME.fullmatch(name):
+            raise OptionError(f"collect.{name}: a name is letters, digits, '.', '_' and '-', at most 64")
+        drivers = [k for k in ("dataset", "policy", "expert") if getattr(part, k)]
+        if len(drivers) != 1:
+            raise OptionError(
+                f"collect.{name}: give one of dataset, policy and expert, not {drivers or 'none'}"
+            )
+        others = [k for k, v in vars(part).items() if k != "dataset" and v not in (None, [], {})]
+        if part.dataset and others:
+            raise OptionError(f"collect.{name}: a dataset is taken as it is; leave out {', '.join(others)}")
+    if not config.screen.policies:
+        raise OptionError("screen.policies is empty: name the screening policies (the paper has four)")
+    for number, policy in enumerate(config.screen.policies):
+        if not policy.path:
+            raise OptionError(f"screen.policies.{number}.path is missing: a folder or Hub id")
+        own = (policy.options, policy.env, policy.rename_map, policy.deterministic)
+        if any(own) and not policy.name:
+            raise OptionError(f"screen.policies.{number}: options of its own need a name")
+    if config.screen.keep is not None and len(config.screen.keep) != 2:
+        raise OptionError(f"screen.keep {config.screen.keep}: two numbers, fewest and most")
+    if len(config.split.sizes) < 2:
+        raise OptionError("split.sizes: name at least two splits, e.g. {train: 0.8, test: 0.2}")
+    if config.annotate.no_consensus not in ("drop", "discuss"):
+        raise OptionError(f"annotate.no_consensus {config.annotate.no_consensus!r}: drop or discuss")
+    if config.license:
+        try:
+            license_metadata(config.license)
+        except ScenarioError as err:
+            raise OptionError(f"license: {err}") from None
+    if config.publish is not None and not config.publish.repo_id:
+        raise OptionError("publish.repo_id is missing: ORG/NAME; or leave publish out")

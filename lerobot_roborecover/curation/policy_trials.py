@@ -1,0 +1,234 @@
+"""Runs a LeRobot checkpoint on scenarios and keeps every trial's actions, exactly as executed.
+
+The trial log names each trial's actions by their hash only. Here they are kept beside it, so that a trial can
+be replayed: for the monitor's frames, or as a demonstration. A rerun goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.env.facts import facts_of
+from lerobot_roborecover.env.run import open_run
+from lerobot_roborecover.env.trial_log import TrialLog, TrialRow, read_trial_log, trial_key
+from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.whole import new_file
+
+TRIALS_FILE = "trials.jsonl"
+ACTIONS_FOLDER = "actions"
+
+
+@dataclass(frozen=True)
+class PolicyTrial:
+    """A finished trial and what was executed in it."""
+
+    row: TrialRow
+    actions: np.ndarray
+    """(steps, A), of the type that the policy gave: replaying them is exact only in that type."""
+
+
+class RecordingHost:
+    """A policy host that remembers the actions of every trial under way.
+
+    Args:
+        host: who acts.
+    """
+
+    def __init__(self, host: Host):
+        self._host = host
+        self.max_batch, self.batched = host.max_batch, host.batched
+        self._chunks: dict[int, list[np.ndarray]] = {}
+
+    def noise(self, seed: int | None) -> str:
+        """As the host's."""
+        return self._host.noise(seed)
+
+    def start(self, seed: int | None) -> tuple[int, Any]:
+        """Fresh history; `seed` names the trial."""
+        if seed is None:
+            raise ValueError("recording needs a run with a seed: it tells trials apart")
+        self._chunks[seed] = []
+        return seed, self._host.start(seed)
+
+    def finish(self, history: tuple[int, Any]) -> None:
+        """Forgets the trial."""
+        self._chunks.pop(history[0], None)
+        self._host.finish(history[1])
+
+    def act(
+        self, observations: Sequence, instructions: Sequence[str], histories: Sequence[tuple[int, Any]]
+    ) -> list[Chunk | PolicyError]:
+        """The host's chunks."""
+        chunks = self._host.act(observations, instructions, [h for _, h in histories])
+        for (seed, _), chunk in zip(histories, chunks, strict=True):
+            if not isinstance(chunk, PolicyError):
+                self._chunks[seed].append(np.array(chunk))
+        return chunks
+
+    def executed(self, row: TrialRow) -> np.ndarray | None:
+        """(steps, A) actions of a trial that has just ended; None where there were none.
+
+        Raises:
+            ScenarioError: they are not those whose hash the row holds.
+        """
+        chunks = self._chunks.get(row.trial_seed) if row.steps else None
+        if not chunks:
+            return None
+        actions = np.concatenate(chunks)[: row.steps]
+        if actions_digest(actions) != row.actions_sha256:
+            raise ScenarioError(
+                f"trial {row.trial} of {row.scenario_id}: the recorded actions are not the executed ones"
+            )
+        return actions
+
+
+class _KeepingLog:
+    """A trial log that puts the actions on disk before the row, so that no row is without them."""
+
+    def __init__(self, log: TrialLog, host: RecordingHost, folder: Path):
+        self._log, self._host, self._folder = log, host, folder
+        self.path = log.path
+
+    @property
+    def rows(self) -> list[TrialRow]:
+        return self._log.rows
+
+    def find(self, key: tuple) -> TrialRow | None:
+        return self._log.find(key)
+
+    def append(self, row: TrialRow) -> None:
+        actions = self._host.executed(row)
+        if actions is not None:
+            with new_file(actions_path(self._folder, row)) as path, open(path, "wb") as file:
+                np.save(file, actions, allow_pickle=False)
+        self._log.append(row)
+
+
+def run_trials(
+    policy: str,
+    env: Any,
+    folder: Path,
+    *,
+    trials: int = 1,
+    seed: int = 1000,
+    device: str | None = None,
+    slots: int = 0,
+    max_batch: int = 64,
+    policy_options: Sequence[str] = (),
+    rename_map: Mapping[str, str] | None = None,
+    on_row: Callable[[TrialRow, int, int], None] = lambda row, done, total: None,
+) -> list[PolicyTrial]:
+    """Runs what the folder does not hold yet, and returns everything.
+
+    Args:
+        policy: folder or Hub id of the checkpoint.
+        env: a recovery env config (`env_config`), which names the scenarios and the observations.
+        folder: of this policy alone: trial log and actions.
+        trials: per scenario.
+        seed: of the run.
+        device: of the policy; None takes what its config says.
+        slots: simulators at work at once; 0 takes one per core.
+        max_batch: observations per inference, at most.
+        policy_options: `--name=value` options of the policy's config.
+        rename_map: the env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
+        on_row: told of each finished trial, and how many are done of how many.
+
+    Returns:
+        Trials by scenario id, then trial index; of exactly this policy, seed and options.
+
+    Raises:
+        OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
+    """
+    from lerobot_roborecover.trials import load
+
+    config = load.policy_config(policy, policy_options, device)
+    facts = facts_of(config, n_episodes=trials)
+    env.trial_log = str(folder / TRIALS_FILE)
+    scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
+    run.protocol = replace(run.protocol, run_seed=seed)
+    units = units_of(sorted(scenarios, key=lambda s: s.id), trials)
+    hash_ = run.protocol.config_hash()
+    keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
+    run.pool.acquire()
+    try:
+        todo = [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
+        if todo:
+            host = RecordingHost(
+                load.load_host(load.HostSpec(config, env, rename_map or {}, seed, max_batch))
+            )
+            run.log = _KeepingLog(run.log, host, folder / ACTIONS_FOLDER)
+            count = [len(units) - len(todo)]
+
+            def told(row: TrialRow) -> None:
+                count[0] += 1
+                on_row(row, count[0], len(units))
+
+            workers = min(slots or os.cpu_count() or 1, len(todo))
+            LocalEngine(run, host, slots=workers, on_row=told).run(todo)
+        rows = {r.key(): r for r in run.log.rows}
+    finally:
+        run.pool.release()
+    return [_with_actions(rows[key], folder / ACTIONS_FOLDER) for key in keys if key in rows]
+
+
+def read_trials(folder: Path) -> list[PolicyTrial]:
+    """Trials that `run_trials` left in a folder, whatever their protocol.
+
+    Raises:
+        TrialLogError, ScenarioError: the log or the actions are damaged.
+    """
+    return [_with_actions(row, folder / ACTIONS_FOLDER) for row in read_trial_log(folder / TRIALS_FILE)]
+
+
+def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> Any:
+    """A recovery env config.
+
+    Args:
+        platform: of the scenarios.
+        scenarios: shipped name, folder or Hub id.
+        options: `--name=value`, as after `--env.`.
+    """
+    import draccus
+
+    from lerobot_roborecover.env.configs import env_type
+
+    return draccus.parse(env_type(platform), args=[f"--scenarios={scenarios}", *options])
+
+
+def actions_digest(actions: np.ndarray) -> str:
+    """What a trial row calls `actions_sha256`."""
+    digest = hashlib.sha256()
+    for action in actions:
+        digest.update(np.ascontiguousarray(action).tobytes())
+    return digest.hexdigest()
+
+
+def actions_path(folder: Path, row: TrialRow) -> Path:
+    """File of a trial's actions, by their own hash."""
+    return folder / f"{row.actions_sha256}.npy"
+
+
+def _with_actions(row: TrialRow, folder: Path) -> PolicyTrial:
+    if not row.steps:
+        return PolicyTrial(row, np.zeros((0, 0), np.float32))
+    path = actions_path(folder, row)
+    try:
+        actions = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as err:
+        raise ScenarioError(
+            f"trial {row.trial} of {row.scenario_id} by {row.policy}: its actions cannot be read ({err}). A "
+            f"log alone cannot be replayed; keep {folder} beside it, or run the policy again in a new folder"
+        ) from None
+    if actions.ndim != 2 or len(actions) != row.steps or actions_digest(actions) != row.actions_sha256:
+        raise ScenarioError(f"{path} does not hold the actions of trial {row.trial} of {row.scenario_id}")
+    return PolicyTrial(row, actions)

@@ -1,0 +1,113 @@
+"""Renders a scenario dataset's prefixes as episodes: the LeRobotDataset that building ends in.
+
+Scenarios are evaluated without episodes; whoever wants to look at them, or train on them, has them here. What
+earlier stages decided and recorded comes along.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.curation.attrition import DECISIONS_FILE, carry_decisions
+from lerobot_roborecover.datasets.read import read_with_manifest
+from lerobot_roborecover.datasets.render import check_rendering, render_dataset
+from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.workers.jobs import JobPool
+
+SIZE = 256
+"""Side of the pictures in pixels, where the simulator lets one choose: that of `collect`."""
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What to render and how."""
+
+    dataset: Path
+    """Folder of a scenario dataset."""
+    out: Path
+    """Folder of the new dataset; new or empty."""
+    size: int = SIZE
+    """Side of the pictures in pixels; RoboTwin's own configuration says how large they are."""
+    env: Sequence[str] = ()
+    """`name=value` options of the recovery env type."""
+    workers: int = 1
+    work: Path | None = None
+    """Finished parts, kept until all are there; None takes `OUT.parts`."""
+
+
+def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
+    """Renders and writes; a rerun goes on where it was stopped.
+
+    Args:
+        request: what and how.
+        progress: told how many parts are done of how many.
+
+    Returns:
+        The number of episodes.
+
+    Raises:
+        ScenarioError, OptionError, SimulatorError: something cannot be used, or the machine cannot render.
+    """
+    check_new(request.out)
+    check_size(request.size)
+    if request.workers < 1:
+        raise OptionError(f"--workers={request.workers}: at least 1")
+    scenarios, manifest = read_with_manifest(request.dataset)
+    empty = [s.id for s in scenarios if not len(s.prefix)]
+    if empty:
+        raise ScenarioError(f"scenario {empty[0]} has an empty prefix, of which there is nothing to render")
+    options = simulator_options(manifest["platform"], request.size, request.env)
+    work = request.work or request.out.with_name(f"{request.out.name}.parts")
+    with (
+        JobPool(manifest["platform"], options, request.workers) as pool,
+        new_folder(request.out) as folder,
+    ):
+        check_rendering(scenarios, pool)
+        render_dataset(
+            folder,
+            scenarios,
+            work,
+            pool=pool,
+            description=manifest.get("description", ""),
+            license=manifest.get("license"),
+            progress=progress,
+        )
+        carry_decisions(request.dataset, folder)
+        for path in sorted((request.dataset / FOLDER).glob("*.json")):
+            if path.name not in (MANIFEST_FILE, DECISIONS_FILE):
+                shutil.copyfile(path, folder / FOLDER / path.name)
+    shutil.rmtree(work, ignore_errors=True)
+    return len(scenarios)
+
+
+def check_size(size: int) -> None:
+    """Checks the side of the pictures.
+
+    Raises:
+        OptionError: a video cannot have it.
+    """
+    if not 16 <= size <= 2048 or size % 2:
+        raise OptionError(f"frames {size}: an even side of 16 to 2048 pixels, e.g. {SIZE}")
+
+
+def simulator_options(platform: str, size: int, env: Sequence[str]) -> dict[str, Any]:
+    """Options of the simulator that renders, as a recovery env of these options would have them.
+
+    Raises:
+        OptionError: there is no such option.
+    """
+    from lerobot_roborecover.curation.policy_trials import env_config
+
+    given = [f"--{o.removeprefix('--')}" for o in env]
+    spec = env_config(platform, "none", given).run_spec()
+    named = {o.removeprefix("--").partition("=")[0] for o in given} - {"obs_type"}
+    wanted = platform_named(platform).picture_options(size)
+    return {**spec.slot.options, **{name: value for name, value in wanted.items() if name not in named}}

@@ -1,0 +1,286 @@
+"""From votes to scenarios: majority for stage and type, median step, no consensus removed or discussed.
+
+The rule (paper, "Stage-Type and Recovery Point Annotation"): labels are determined by majority vote across
+annotators, and trajectories without consensus are removed. Here, with n votes on a candidate:
+
+1. Discarded where more than n / 2 discard it; the reason is the one most of them gave.
+2. Stage and type each need more than n / 2 votes, counting those who discard as votes for none.
+3. The recovery point is the median of the steps marked, the lower of the two in the middle; more than n / 2
+   votes must lie within the tolerance of it.
+
+Votes of a discussion take the place of those of the round before, candidate by candidate.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from lerobot_roborecover.curation.agreement import Agreement, agreement
+from lerobot_roborecover.curation.annotation.annotators import label_kind
+from lerobot_roborecover.curation.annotation.discussion import MAX_ROUNDS, Discussion
+from lerobot_roborecover.curation.annotation.votes import Vote, ballot, read_votes
+from lerobot_roborecover.curation.attrition import (
+    Decision,
+    carry_decisions,
+    read_decisions,
+    record_decisions,
+    standing,
+)
+from lerobot_roborecover.curation.candidates import CandidateSet
+from lerobot_roborecover.datasets import write_scenarios
+from lerobot_roborecover.scenario import Scenario, ScenarioError
+
+NOT_PEOPLES = {
+    "people": "",
+    "automatic": "Recovery points, stages and types are automatic labels, not people's: programs applied "
+    "written rules to what the annotation page shows.",
+    "mixed": "Some votes behind recovery points, stages and types are programs', not people's.",
+}
+"""What a dataset's description says of its labels, by their kind."""
+
+
+@dataclass(frozen=True)
+class ResolutionConfig:
+    """How votes become labels."""
+
+    annotators: int = 3
+    """Votes that a candidate needs (paper: three)."""
+    tolerance_steps: int = 10
+    """How far from the median a marked step may lie and still support it."""
+    no_consensus: Literal["discuss", "drop"] = "discuss"
+    """What becomes of a candidate without consensus."""
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """What the votes on one candidate amount to."""
+
+    candidate: str
+    outcome: Literal["kept", "dropped", "no consensus", "waiting"]
+    reason: str = ""
+    detail: str = ""
+    step: int | None = None
+    stage: str = ""
+    deviation: str = ""
+    votes: tuple[Vote, ...] = ()
+    """That were counted."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """What the votes on a dataset amount to."""
+
+    candidates: tuple[Resolved, ...]
+    """Of those that the stages before kept, in the order of the dataset."""
+    agreement: tuple[Agreement, ...]
+    """Before resolution, over blind votes of the first round."""
+    annotators: tuple[str, ...]
+    rounds: int
+    """The latest round with votes."""
+
+    @property
+    def kind(self) -> str:
+        """Whose votes these are: `people`, `automatic` or `mixed`."""
+        return label_kind(self.annotators)
+
+    def counts(self) -> dict[str, int]:
+        """Number of candidates by outcome."""
+        return dict(Counter(r.outcome for r in self.candidates))
+
+
+def resolve_votes(candidate: str, votes: Sequence[Vote], config: ResolutionConfig) -> Resolved:
+    """Resolves one candidate.
+
+    Args:
+        candidate: its id.
+        votes: one an annotator.
+        config: the rule.
+    """
+    n, given = len(votes), tuple(votes)
+    if n < config.annotators:
+        return Resolved(candidate, "waiting", detail=f"{n} of {config.annotators} votes", votes=given)
+    discards = [v for v in votes if v.verdict == "discard"]
+    if 2 * len(discards) > n:
+        reason = max(Counter(v.reason for v in discards).items(), key=lambda item: (item[1], item[0]))[0]
+        return Resolved(
+            candidate, "dropped", f"discarded: {reason}", f"{len(discards)} of {n} votes", votes=given
+        )
+    marked = [v for v in votes if v.verdict == "recovery"]
+    labels = {}
+    for axis, values in (("stage", [v.stage for v in marked]), ("type", [v.deviation for v in marked])):
+        label, count = max(Counter(values).items(), key=lambda item: (item[1], item[0]), default=("", 0))
+        if 2 * count <= n:
+            said = ", ".join(f"{k} {m}" for k, m in sorted(Counter(values).items()))
+            said += f", discard {len(discards)}" if discards else ""
+            return Resolved(candidate, "no consensus", f"no majority: {axis}", said, votes=given)
+        labels[axis] = label
+    steps = [v.step for v in marked if v.step is not None]
+    median = statistics.median_low(steps)
+    near = sum(abs(step - median) <= config.tolerance_steps for step in steps)
+    if 2 * near <= n:
+        detail = f"steps {', '.join(map(str, sorted(steps)))}; {near} of {n} within {config.tolerance_steps}"
+        return Resolved(candidate, "no consensus", "no majority: recovery point", detail, votes=given)
+    detail = f"step {median} of {', '.join(map(str, sorted(steps)))}"
+    return Resolved(candidate, "kept", "", detail, median, labels["stage"], labels["type"], given)
+
+
+def resolve(candidates: CandidateSet, folder: Path, config: ResolutionConfig) -> Resolution:
+    """Resolves a dataset's votes and measures the agreement before that.
+
+    Args:
+        candidates: the dataset.
+        folder: of the votes.
+        config: the rule.
+
+    Raises:
+        ScenarioError: there are no votes, one is of an unknown candidate or an impossible step, or there are
+            more annotators than the rule expects.
+    """
+    records = read_votes(folder)
+    names = tuple(name for name, r in records.items() if any(x.get("kind") == "vote" for x in r))
+    if len(names) > config.annotators:
+        raise ScenarioError(
+            f"{folder} holds votes of {len(names)} annotators ({', '.join(names)}), but "
+            f"{config.annotators} are expected. Say --votes-needed {len(names)}, or move a file away"
+        )
+    queue = [c.id for c in candidates.candidates if c.id in queued(candidates)]
+    rounds = 1
+    latest: dict[str, dict[str, Vote]] = {c: {} for c in queue}
+    blind: dict[str, list[Vote]] = {c: [] for c in queue}
+    for number in range(1, MAX_ROUNDS + 1):
+        in_round: dict[str, dict[str, Vote]] = {}
+        for name in names:
+            found = ballot(records[name], number)
+            for candidate, vote in found.votes.items():
+                _check_vote(candidates, name, vote)
+                in_round.setdefault(candidate, {})[name] = vote
+            if number == 1:
+                for candidate, vote in found.blind.items():
+                    if candidate in blind:
+                        blind[candidate].append(vote)
+        for candidate, votes in in_round.items():
+            # A discussion counts once everybody has voted again; until then the round before stands.
+            if candidate in latest and (number == 1 or len(votes) >= config.annotators):
+                latest[candidate] = votes
+                rounds = max(rounds, number)
+    resolved = tuple(resolve_votes(c, [latest[c][n] for n in sorted(latest[c])], config) for c in queue)
+    measured = agreement(blind, config.annotators, config.tolerance_steps)
+    return Resolution(resolved, tuple(measured), names, rounds)
+
+
+def queued(candidates: CandidateSet) -> set[str]:
+    """Candidates that annotators see: all but those that a stage before has dropped."""
+    decisions = read_decisions(candidates.root)
+    dropped = {d.candidate for d in decisions} - standing(decisions, "collect")
+    return {c.id for c in candidates.candidates} - dropped
+
+
+def _check_vote(candidates: CandidateSet, name: str, vote: Vote) -> None:
+    episode = candidates.by_id.get(vote.candidate)
+    if episode is None:
+        raise ScenarioError(
+            f"{name} has voted on {vote.candidate!r:.80}, which is not in {candidates.root}. Name the votes "
+            "of this dataset: --votes FOLDER"
+        )
+    if vote.step is not None and not 0 < vote.step < candidates.row(episode).steps:
+        raise ScenarioError(
+            f"{name} has marked step {vote.step} of {vote.candidate}, which has frames 0 to "
+            f"{candidates.row(episode).steps - 1}"
+        )
+
+
+def decisions_of(resolution: Resolution, config: ResolutionConfig) -> list[Decision]:
+    """The stage's decisions; candidates that wait for votes or a discussion are undecided."""
+    found = []
+    whose = {"people": "votes", "automatic": "automatic votes", "mixed": "votes, some automatic,"}
+    by = f"{whose[resolution.kind]} of {', '.join(resolution.annotators)}"
+    for r in resolution.candidates:
+        if r.outcome == "kept":
+            verdict = "kept"
+        elif r.outcome == "dropped" or (r.outcome == "no consensus" and config.no_consensus == "drop"):
+            verdict = "dropped"
+        else:
+            verdict = "undecided"
+        found.append(Decision(r.candidate, "annotate", verdict, r.reason, r.detail, by))
+    return found
+
+
+def scenarios_of(
+    candidates: CandidateSet, resolution: Resolution, config: ResolutionConfig
+) -> list[Scenario]:
+    """The kept candidates as scenarios, every vote in their provenance."""
+    rule = {
+        "rule": "majority of stage and type, median step",
+        "votes_needed": config.annotators,
+        "tolerance_steps": config.tolerance_steps,
+    }
+    return [
+        candidates.scenario(
+            r.candidate,
+            r.step or 0,
+            r.stage,
+            r.deviation,
+            {
+                "annotation": {
+                    "kind": label_kind(v.annotator for v in r.votes),
+                    **rule,
+                    "votes": [asdict(v) for v in r.votes],
+                }
+            },
+        )
+        for r in resolution.candidates
+        if r.outcome == "kept"
+    ]
+
+
+def write_resolution(
+    root: Path,
+    candidates: CandidateSet,
+    resolution: Resolution,
+    config: ResolutionConfig,
+    *,
+    description: str = "",
+    license: str | None = None,
+) -> Path:
+    """Writes the kept candidates as a scenario dataset, with the decisions so far.
+
+    Args:
+        root: the dataset's folder; a set that is there already is replaced.
+        candidates: what was voted on.
+        resolution: what the votes amount to.
+        config: the rule.
+        description: free text for the manifest.
+        license: SPDX identifier, or None.
+
+    Raises:
+        ScenarioError: no candidate was kept.
+    """
+    scenarios = scenarios_of(candidates, resolution, config)
+    if not scenarios:
+        raise ScenarioError(f"no candidate is resolved to a scenario yet: {resolution.counts()}")
+    record_decisions(candidates.root, decisions_of(resolution, config))
+    description = " ".join(filter(None, (description, NOT_PEOPLES[resolution.kind])))
+    write_scenarios(root, scenarios, description=description, license=license)
+    carry_decisions(candidates.root, root)
+    return root
+
+
+def write_discussion(path: Path, resolution: Resolution) -> int:
+    """Writes the candidates without consensus as a list for a further round of `roborecover annotate`.
+
+    Returns:
+        The number of candidates; nothing is written where there are none.
+    """
+    listed = {
+        r.candidate: (f"{r.reason} ({r.detail})", r.votes)
+        for r in resolution.candidates
+        if r.outcome == "no consensus"
+    }
+    if listed:
+        Discussion.of(resolution.rounds + 1, listed).write(path)
+    return len(listed)

@@ -1,0 +1,174 @@
+"""Screens a scenario dataset with policies and writes those scenarios that stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from lerobot_roborecover.curation.screen.runs import (
+    PolicySpec,
+    check_policies,
+    forget_trials,
+    run_policy,
+    take_trials,
+)
+from lerobot_roborecover.curation.screen.screening import (
+    Screened,
+    ScreenRule,
+    histogram,
+    provenance_of,
+    screen,
+)
+from lerobot_roborecover.curation.stage_dataset import write_stage
+from lerobot_roborecover.datasets import load_scenarios, read_scenarios
+from lerobot_roborecover.datasets.frame_files import FrameStore
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.whole import check_new
+
+SCREENING_FILE = "screening.json"
+
+
+@dataclass(frozen=True)
+class ScreenRequest:
+    """What to screen, with whom and how."""
+
+    dataset: str
+    """Folder, Hub id or shipped name of the scenario set."""
+    policies: Sequence[PolicySpec]
+    out: Path
+    """Folder of the new dataset."""
+    trials_folder: Path | None = None
+    """Where trials are kept between runs; None takes `OUT.trials`."""
+    rule: ScreenRule = field(default_factory=ScreenRule)
+    deterministic: Sequence[str] = ()
+    """Names of policies that do the same in every trial: one is run of each scenario, and counts as all."""
+    run_seed: int = 1000
+    env: Sequence[str] = ()
+    """`name=value` options of the recovery env type, for all policies."""
+    trials_from: Sequence[Path] = ()
+    """Trials folders of other machines, taken over first."""
+    shard: str = ""
+    """`k/n`: run this part's trials only, and write no dataset."""
+    retry: Sequence[str] = ()
+    """Invalid outcomes whose trials run again."""
+    device: str | None = None
+    slots: int = 0
+    max_batch: int = 64
+
+    @property
+    def trials(self) -> Path:
+        """The trials' folder."""
+        return self.trials_folder or self.out.with_name(f"{self.out.name}.trials")
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What a screening gave."""
+
+    found: list[Screened]
+    """Empty where only a shard's trials were run."""
+    rows: Mapping[str, Sequence[TrialRow]]
+    """By the policy's name."""
+
+
+def screen_dataset(
+    request: ScreenRequest,
+    progress: Callable[[str, int, int], None] = lambda policy, done, total: None,
+) -> Screening:
+    """Runs the trials that are missing, judges, and writes.
+
+    Args:
+        request: what and how.
+        progress: told of each finished trial: the policy's name, and how many are done of how many.
+
+    Raises:
+        OptionError, ScenarioError: the request makes no sense, or no scenario stays.
+        SimulatorError, TrialLogError: what `roborecover eval` refuses.
+    """
+    check_policies(request.policies)
+    unknown = set(request.deterministic) - {p.name for p in request.policies}
+    if unknown:
+        raise OptionError(
+            f"--deterministic {' '.join(sorted(unknown))}: not among the policies "
+            f"{', '.join(p.name for p in request.policies)}"
+        )
+    for option in (*request.env, *(o for p in request.policies for o in p.env)):
+        if option.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
+            raise OptionError(
+                f"--env {option}: screening settles this itself"
+                + ("; use --shard" if option.startswith("shard") else "")
+            )
+    request.rule.check(len(request.policies))
+    if not request.shard:
+        check_new(request.out)
+    scenarios = load_scenarios(request.dataset)
+    rows: dict[str, list[TrialRow]] = {}
+    for policy in request.policies:
+        folder = request.trials / policy.name
+        for other in request.trials_from:
+            if (other / policy.name).is_dir():
+                take_trials(other / policy.name, folder)
+        if request.retry:
+            forget_trials(folder, request.retry)
+        count = 1 if policy.name in request.deterministic else request.rule.trials
+        trials = run_policy(
+            policy, request.dataset, scenarios.platform, request.trials, trials=count,
+            run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
+            slots=request.slots, max_batch=request.max_batch,
+            on_row=lambda row, done, total, name=policy.name: progress(name, done, total),
+        )  # fmt: skip
+        rows[policy.name] = [t.row for t in trials]
+    if request.shard:
+        return Screening([], rows)
+    found = screen(scenarios, rows, request.rule, request.deterministic)
+    source = Path(request.dataset).expanduser()
+    write_stage(
+        request.out,
+        source if source.is_dir() else None,
+        [_screened(s, request.run_seed) for s in found if s.decision.verdict == "kept"],
+        (s.decision for s in found),
+        (SCREENING_FILE, _record(found, request, rows)),
+        scenarios.manifest,
+    )
+    return Screening(found, rows)
+
+
+def validate_next(out: Path, trials: Path) -> list[str]:
+    """Arguments of the `validate` that follows, which needs the original frames of every scenario: those that
+    the dataset holds, or else the candidates'."""
+    argv = ["validate", str(out), "--trials-folder", str(trials)]
+    store = FrameStore(out)
+    if any(s.id not in store for s in read_scenarios(out)):
+        argv += ["--candidates", "CANDIDATES"]
+    return [*argv, "--out", "VALIDATED"]
+
+
+def _screened(found: Screened, run_seed: int) -> Scenario:
+    note = provenance_of(found, run_seed)
+    return replace(found.scenario, provenance={**found.scenario.provenance, "screening": note})
+
+
+def _record(
+    found: Sequence[Screened], request: ScreenRequest, rows: Mapping[str, Sequence[TrialRow]]
+) -> dict:
+    low, high = request.rule.check(len(request.policies))
+    return {
+        "rule": {**asdict(request.rule), "successes": [low, high]},
+        "deterministic": sorted(request.deterministic),
+        "run_seed": request.run_seed,
+        "env": list(request.env),
+        "policies": [
+            {
+                "name": p.name,
+                "policy": sorted({r.policy for r in rows[p.name]}),
+                "options": list(p.options),
+                "env": list(p.env),
+                "rename_map": dict(p.rename_map),
+            }
+            for p in request.policies
+        ],
+        "scenarios_by_successes": histogram(found),
+    }

@@ -1,0 +1,288 @@
+"""Which scenarios are of intermediate difficulty, by how often screening policies recover from them.
+
+Each scenario is run from its recovery point by every policy several times; it stays where the successes of
+all policies together lie within bounds. The paper: four policies, five trials, 2 to 18 successes of 20, which
+is 10 % to 90 % ("Policy Difficulty Filtering"). Pure functions of trial rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
+
+KEEP = ("0.1", "0.9")
+"""Shares of all trials (paper: a recovery rate between 10 % and 90 %); 2 to 18 of 20."""
+_BAR = 40
+
+
+@dataclass(frozen=True)
+class ScreenRule:
+    """Who stays; the defaults are the paper's."""
+
+    trials: int = 5
+    """Of each policy on each scenario."""
+    keep: tuple[str, str] = KEEP
+    """Fewest and most successes that stay: two counts, or two shares of all trials (with a decimal point)."""
+    max_invalid: int = 0
+    """Invalid trials that a scenario may have; they count as failures. With more it is dropped."""
+
+    def __post_init__(self):
+        if self.trials < 1 or self.max_invalid < 0:
+            raise ScenarioError(
+                f"{self.trials} trials, at most {self.max_invalid} invalid: there must be at least one "
+                "trial, and no fewer than 0 invalid ones"
+            )
+        self.bounds(1)
+
+    def bounds(self, policies: int) -> tuple[int, int]:
+        """Fewest and most successes, with so many policies.
+
+        Raises:
+            ScenarioError: they are not counts or shares in order, or there are not as many trials.
+        """
+        total = policies * self.trials
+        shares = ["." in str(text) for text in self.keep]
+        try:
+            low, high = (Fraction(str(text)) for text in self.keep)
+        except (ValueError, ZeroDivisionError):
+            low, high = Fraction(-1), Fraction(-1)
+        if shares[0] != shares[1] or not 0 <= low <= high or (shares[0] and high > 1):
+            raise ScenarioError(
+                f"keep {self.keep[0]} to {self.keep[1]}: neither two counts in order, such as 2 18, nor two "
+                "shares of all trials, such as 0.1 0.9"
+            )
+        if shares[0]:
+            return math.ceil(low * total), math.floor(high * total)
+        if low.denominator != 1 or high.denominator != 1:
+            raise ScenarioError(f"keep {self.keep[0]} to {self.keep[1]}: counts are whole numbers")
+        return int(low), int(high)
+
+    def check(self, policies: int) -> tuple[int, int]:
+        """The bounds, once it is known how many policies there are.
+
+        Raises:
+            ScenarioError: nothing, or everything, would be kept whatever happens.
+        """
+        low, high = self.bounds(policies)
+        total = policies * self.trials
+        if low > high or low > total:
+            raise ScenarioError(
+                f"keep {self.keep[0]} to {self.keep[1]}: of {policies} policies x {self.trials} trials = "
+                f"{total} no scenario can stay ({low} to {high} successes). Give other bounds with "
+                "--keep, or more trials"
+            )
+        return low, min(high, total)
+
+
+@dataclass(frozen=True)
+class PolicyCount:
+    """One policy's trials on one scenario."""
+
+    policy: str
+    """As trial rows name it: checkpoint and content hash or commit."""
+    successes: int
+    trials: int
+    invalid: Mapping[str, int]
+    """Trials by invalid outcome."""
+    each_counts: int = 1
+    """As how many of the rule's trials a trial counts: all of them, where the policy is deterministic."""
+
+
+@dataclass(frozen=True)
+class Screened:
+    """One scenario's trials and what they amount to."""
+
+    scenario: Scenario
+    counts: Mapping[str, PolicyCount]
+    """By the policy's name in this screening."""
+    rule: ScreenRule
+
+    @property
+    def successes(self) -> int:
+        """Of all policies."""
+        return sum(c.successes * c.each_counts for c in self.counts.values())
+
+    @property
+    def trials(self) -> int:
+        """Of all policies."""
+        return sum(c.trials * c.each_counts for c in self.counts.values())
+
+    @property
+    def invalid(self) -> Counter[str]:
+        """Invalid trials of all policies, by outcome."""
+        found: Counter[str] = Counter()
+        for count in self.counts.values():
+            found.update({outcome: n * count.each_counts for outcome, n in count.invalid.items()})
+        return found
+
+    @cached_property
+    def decision(self) -> Decision:
+        """Whether it stays, and why not."""
+        low, high = self.rule.check(len(self.counts))
+        each = ", ".join(
+            f"{name} {c.successes}/{c.trials}{f' (x {c.each_counts})' if c.each_counts > 1 else ''}"
+            for name, c in self.counts.items()
+        )
+        detail = f"{self.successes} of {self.trials} successes ({each}); {low} to {high} stay"
+        if self.invalid:
+            named = sorted(self.invalid.items())
+            detail += "; invalid: " + ", ".join(f"{n} {outcome}" for outcome, n in named)
+        reason = ""
+        if self.invalid.total() > self.rule.max_invalid:
+            reason = f"invalid trials: {', '.join(sorted(self.invalid))}"
+        elif self.successes > high:
+            reason = "too easy"
+        elif self.successes < low:
+            reason = "too hard"
+        by = f"{self.trials} trials of {len(self.counts)} policies"
+        return Decision(self.scenario.id, "screen", "dropped" if reason else "kept", reason, detail, by)
+
+
+def screen(
+    scenarios: Sequence[Scenario],
+    rows: Mapping[str, Sequence[TrialRow]],
+    rule: ScreenRule,
+    deterministic: Collection[str] = (),
+) -> list[Screened]:
+    """Judges every scenario.
+
+    Args:
+        scenarios: in any order.
+        rows: trials by the policy's name; those of other scenarios, from other starts, or beyond the rule's
+            number of trials are left out. Their order does not matter.
+        rule: who stays.
+        deterministic: names of policies that do the same in every trial: one of each scenario counts as all.
+
+    Returns:
+        One result a scenario, in their order.
+
+    Raises:
+        ScenarioError: a scenario lacks a trial of a policy, or two trials of a deterministic one differ.
+    """
+    rule.check(len(rows))
+    of: dict[tuple[str, str, str], dict[int, TrialRow]] = defaultdict(dict)
+    for name, given in rows.items():
+        for row in given:
+            if row.start == Start.RECOVERY.value and not row.interventions and row.trial < rule.trials:
+                of[name, row.scenario_id, row.scenario_sha256][row.trial] = row
+    result = []
+    for scenario in scenarios:
+        counts = {}
+        for name in sorted(rows):
+            mine = of[name, scenario.id, scenario.sha256()]
+            found, each_counts = [mine[trial] for trial in sorted(mine)], 1
+            needed = 1 if name in deterministic else rule.trials
+            if len(found) < needed:
+                raise ScenarioError(
+                    f"scenario {scenario.id} has {len(found)} of {needed} trials by {name}; run the "
+                    "command again to finish them"
+                )
+            if name in deterministic:
+                found, each_counts = [_the_one(name, found)], rule.trials
+            counts[name] = _count(found, each_counts)
+        result.append(Screened(scenario, counts, rule))
+    return result
+
+
+def _the_one(name: str, rows: Sequence[TrialRow]) -> TrialRow:
+    """The trial that stands for all."""
+    for row in rows[1:]:
+        if (row.outcome, row.actions_sha256) != (rows[0].outcome, rows[0].actions_sha256):
+            raise ScenarioError(
+                f"{name} is said to be deterministic, but trials {rows[0].trial} and {row.trial} of "
+                f"{row.scenario_id} differ ({rows[0].outcome} after {rows[0].steps} steps, {row.outcome} "
+                f"after {row.steps}); leave out --deterministic {name}"
+            )
+    return rows[0]
+
+
+def _count(rows: Sequence[TrialRow], each_counts: int) -> PolicyCount:
+    invalid = Counter(r.outcome for r in rows if not Outcome(r.outcome).valid)
+    policies = sorted({r.policy for r in rows})
+    return PolicyCount(
+        policies[0] if len(policies) == 1 else ", ".join(policies),
+        sum(r.success for r in rows),
+        len(rows),
+        dict(sorted(invalid.items())),
+        each_counts,
+    )
+
+
+def provenance_of(found: Screened, run_seed: int) -> dict[str, Any]:
+    """What a scenario keeps of its screening."""
+    return {
+        "successes": found.successes,
+        "trials": found.trials,
+        "keep": list(found.rule.check(len(found.counts))),
+        "run_seed": run_seed,
+        "policies": {name: asdict(count) for name, count in found.counts.items()},
+    }
+
+
+def histogram(found: Sequence[Screened]) -> list[int]:
+    """Scenarios by number of successes, from none to all, those with too many invalid trials included."""
+    total = max((s.trials for s in found), default=0)
+    counts = Counter(s.successes for s in found)
+    return [counts[n] for n in range(total + 1)]
+
+
+def format_histogram(found: Sequence[Screened], rule: ScreenRule) -> str:
+    """The histogram as text; successes that stay are marked."""
+    bars = histogram(found)
+    low, high = rule.check(len(found[0].counts)) if found else (0, 0)
+    scale = max(max(bars, default=0) / _BAR, 1.0)
+    lines = [f"{'successes':>9} {'scenarios':>9}   (| stays)"]
+    for successes, count in enumerate(bars):
+        mark = "|" if low <= successes <= high else " "
+        lines.append(f"{successes:>9} {count:>9} {mark} {'#' * math.ceil(count / scale)}".rstrip())
+    return "\n".join(lines)
+
+
+def format_policies(found: Sequence[Screened]) -> str:
+    """Each policy's recovery rate over all screened scenarios, and over those that stay, as text.
+
+    Rates weigh scenarios equally; intervals are those of every table (`analysis/intervals.py`), over the
+    platform's units.
+    """
+    kept = [s for s in found if s.decision.verdict == "kept"]
+    names = sorted({name for s in found for name in s.counts})
+    width = max([len("policy"), *map(len, names)])
+    lines = [f"{'policy':<{width}}  {'recovered %':<21}{'of those kept %':<21}{'trials':>7}{'invalid':>9}"]
+    for name in names:
+        counts = [s.counts[name] for s in found]
+        trials, invalid = (sum(ns) for ns in ([c.trials for c in counts], [*map(_invalid, counts)]))
+        cells = f"{_rate(found, name):<21}{_rate(kept, name):<21}"
+        lines.append(f"{name:<{width}}  {cells}{trials:>7}{invalid:>9}")
+    return "\n".join(lines)
+
+
+def _invalid(count: PolicyCount) -> int:
+    return sum(count.invalid.values())
+
+
+def _rate(found: Sequence[Screened], policy: str) -> str:
+    from lerobot_roborecover.analysis.summary import rate_estimate
+    from lerobot_roborecover.analysis.units import default_unit, unit_labels
+
+    if not found:
+        return "n/a"
+    counts = [s.counts[policy] for s in found]
+    rates = np.array([c.successes / c.trials for c in counts])
+    scenarios = [s.scenario for s in found]
+    unit = default_unit(scenarios[0].task.platform)
+    ids, clusters = [s.id for s in scenarios], [s.cluster for s in scenarios]
+    units = unit_labels(unit, ids, clusters, [s.task.name for s in scenarios])
+    estimate = rate_estimate(rates, units.tolist())
+    value, low, high = (100 * x for x in (estimate.value, estimate.low, estimate.high))
+    return f"{value:5.1f}" if low != low else f"{value:5.1f} [{low:.1f}, {high:.1f}]"

@@ -1,0 +1,309 @@
+"""Divides scenarios into splits that share nothing they must not, in the wanted sizes, as balanced as can be.
+
+What two scenarios share that would leak from one split into another (paper, appendix "Corpus Composition"):
+
+- trajectory: the same source trajectory, by its name (`cluster`) or because one prefix is the beginning of
+  the other from the same reset;
+- record: the same source record (`provenance.source_record`), or the same recovery state;
+- instruction: the same task and instruction. On RoboTwin, where instructions vary within a task; elsewhere
+  all scenarios of a task share one.
+
+Scenarios that share anything, directly or through others, form a group that stays together. Groups of the
+same make-up (how many scenarios of each cell, source and suite) are interchangeable, so the sizes are an
+integer programme over kinds of groups: exact counts, and each split's composition as near to its share,
+rounded down or up, as can be. The seed decides which groups of a kind go where, and which of several equally
+good programmes is taken.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.scenario import Scenario, ScenarioError
+
+APART = ("trajectory", "record", "instruction")
+_AXES = {
+    "cell": lambda s: s.cell,
+    "source": lambda s: s.source.value,
+    "suite": lambda s: s.task.suite,
+    "cell, source and suite": lambda s: f"{s.cell} / {s.source.value} / {s.task.suite}",
+}
+"""What splits are balanced over. The last one counts less: it decides among what the others leave open."""
+_JOINT_WEIGHT = 0.25
+_NODES = 200
+"""Branch-and-bound nodes: a limit that gives the same result on every machine, unlike one of time."""
+
+
+@dataclass(frozen=True)
+class SplitConfig:
+    """How to divide."""
+
+    sizes: Mapping[str, int | float]
+    """By split: a number of scenarios, or a fraction below 1; all of one kind. Counts are met exactly,
+    fractions as closely as the groups allow."""
+    seed: int = 42
+    apart: tuple[str, ...] | None = None
+    """What no two splits may share, of `APART`; None takes what fits the platform."""
+
+
+def parse_sizes(given: Mapping[str, str]) -> dict[str, int | float]:
+    """Sizes as they are written on a command line.
+
+    Raises:
+        ScenarioError: one is neither a count nor a fraction, or they are of both kinds.
+    """
+    sizes: dict[str, int | float] = {}
+    for name, text in given.items():
+        try:
+            value: int | float = float(text) if "." in text else int(text)
+        except ValueError:
+            value = -1
+        if not (0 < value < 1 if isinstance(value, float) else 0 <= value <= 10**9):
+            raise ScenarioError(
+                f"split {name!r:.40}: size {text!r:.40} is neither a count nor a fraction like 0.8"
+            )
+        sizes[name] = value
+    if len(sizes) < 2:
+        raise ScenarioError("name at least two splits, e.g. --train 800 --test 200 or --train 0.8 --test 0.2")
+    if len({type(v) for v in sizes.values()}) > 1:
+        raise ScenarioError(f"sizes {dict(given)} mix counts and fractions; write one kind")
+    if all(isinstance(v, float) for v in sizes.values()) and abs(sum(sizes.values()) - 1) > 1e-6:
+        raise ScenarioError(f"fractions {dict(given)} add up to {sum(sizes.values()):g}, not to 1")
+    return sizes
+
+
+def parse_apart(text: str | None) -> tuple[str, ...] | None:
+    """Keys as they are written on a command line.
+
+    Raises:
+        ScenarioError: one is unknown.
+    """
+    if text is None:
+        return None
+    keys = tuple(key.strip() for key in text.split(",") if key.strip())
+    unknown = [key for key in keys if key not in APART]
+    if unknown or not keys:
+        raise ScenarioError(f"--apart {text!r:.80}: {unknown[:1] or 'nothing'} is not of {', '.join(APART)}")
+    return keys
+
+
+def apart_for(scenarios: Sequence[Scenario], apart: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The keys that hold for a set."""
+    if apart is not None:
+        return apart
+    return platform_named(scenarios[0].platform).apart if scenarios else APART
+
+
+def shared(scenarios: Sequence[Scenario], apart: Sequence[str]) -> dict[str, dict[str, list[int]]]:
+    """What scenarios share: by key and value, the positions of two or more scenarios."""
+    found: dict[str, dict[str, list[int]]] = {key: defaultdict(list) for key in apart}
+    for i, scenario in enumerate(scenarios):
+        if "trajectory" in found and scenario.cluster:
+            found["trajectory"][scenario.cluster].append(i)
+        if "record" in found:
+            found["record"][f"state {scenario.sha256()}"].append(i)
+            record = scenario.provenance.get("source_record")
+            if isinstance(record, str) and record:
+                found["record"][record].append(i)
+        if "instruction" in found:
+            found["instruction"][f"{scenario.task.name}: {scenario.task.instruction}"].append(i)
+    if "trajectory" in found:
+        for name, members in _continuations(scenarios):
+            found["trajectory"][name] += members
+    return {
+        key: {value: members for value, members in values.items() if len(members) > 1}
+        for key, values in found.items()
+    }
+
+
+def _continuations(scenarios: Sequence[Scenario]) -> Iterable[tuple[str, list[int]]]:
+    """Scenarios whose prefix is the beginning of another's, from the same reset: one trajectory, two points.
+
+    The longer one is looked up by each shorter one's length and bytes.
+    """
+    by_start: dict[tuple, list[int]] = defaultdict(list)
+    for i, s in enumerate(scenarios):
+        r = s.reset
+        by_start[s.task.suite, s.task.name, r.seed, r.init_state_index, r.settle_steps].append(i)
+    for members in by_start.values():
+        for i in members:
+            # Settling alone is what all rollouts from one reset share.
+            short = scenarios[i].prefix
+            if len(short) <= scenarios[i].reset.settle_steps:
+                continue
+            same = [j for j in members if np.array_equal(scenarios[j].prefix[: len(short)], short)]
+            if len(same) > 1:
+                yield f"beginning of {scenarios[i].id}", same
+
+
+def groups_of(scenarios: Sequence[Scenario], apart: Sequence[str]) -> list[list[int]]:
+    """Positions of scenarios that must stay together, each group in order, the groups by their first id."""
+    parent = list(range(len(scenarios)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    for values in shared(scenarios, apart).values():
+        for members in values.values():
+            for other in members[1:]:
+                parent[root(other)] = root(members[0])
+    groups: dict[int, list[int]] = defaultdict(list)
+    for i in range(len(scenarios)):
+        groups[root(i)].append(i)
+    ordered = [sorted(members, key=lambda i: scenarios[i].id) for members in groups.values()]
+    return sorted(ordered, key=lambda members: scenarios[members[0]].id)
+
+
+def assign(scenarios: Sequence[Scenario], config: SplitConfig) -> dict[str, str]:
+    """Assigns every scenario to a split.
+
+    Args:
+        scenarios: of one platform; their order does not matter.
+        config: sizes and seed.
+
+    Returns:
+        Split by scenario id.
+
+    Raises:
+        ScenarioError: the counts do not add up, or groups make them impossible; the nearest that are
+            possible are named.
+    """
+    names = sorted(config.sizes)
+    counts = _counts(len(scenarios), config.sizes)
+    groups = groups_of(scenarios, apart_for(scenarios, config.apart))
+    rng = np.random.default_rng(config.seed)
+    kinds: dict[tuple, list[list[int]]] = defaultdict(list)
+    for members in groups:
+        kinds[
+            tuple(sorted(Counter(_AXES["cell, source and suite"](scenarios[i]) for i in members).items()))
+        ].append(members)
+    ordered = sorted(kinds.items())
+    # The solver takes the first of several equally good solutions: the order makes it the seed's.
+    ordered = [ordered[i] for i in rng.permutation(len(ordered))]
+    wanted = np.array([counts[name] for name in names], dtype=float)
+    exact = all(isinstance(v, int) for v in config.sizes.values())
+    table = _solve(scenarios, [members for _, members in ordered], wanted, exact, names)
+    result: dict[str, str] = {}
+    for (_, members), row in zip(ordered, table, strict=True):
+        targets = [name for name, number in zip(names, row, strict=True) for _ in range(number)]
+        for position, target in zip(rng.permutation(len(members)), targets, strict=True):
+            result |= {scenarios[i].id: target for i in members[position]}
+    return result
+
+
+def _counts(total: int, sizes: Mapping[str, int | float]) -> dict[str, int]:
+    """Counts by split; fractions are rounded by their largest remainders."""
+    if all(isinstance(v, int) for v in sizes.values()):
+        if sum(sizes.values()) != total:
+            missing = total - sum(sizes.values())
+            raise ScenarioError(
+                f"splits {dict(sizes)} hold {sum(sizes.values())} scenarios; the dataset has {total}. "
+                + (f"Add --split unused={missing}, or select first" if missing > 0 else "Ask for fewer")
+            )
+        return {name: int(v) for name, v in sizes.items()}
+    exact = {name: total * v for name, v in sizes.items()}
+    counts = {name: int(v) for name, v in exact.items()}
+    by_rest = sorted(exact, key=lambda name: (counts[name] - exact[name], name))
+    for name in by_rest[: total - sum(counts.values())]:
+        counts[name] += 1
+    return counts
+
+
+def _solve(
+    scenarios: Sequence[Scenario],
+    kinds: Sequence[Sequence[Sequence[int]]],
+    wanted: np.ndarray,
+    exact: bool,
+    names: Sequence[str],
+) -> np.ndarray:
+    """(kinds, splits) int: how many groups of each kind go to each split."""
+    available = np.array([len(groups) for groups in kinds])
+    sizes = np.array([len(groups[0]) for groups in kinds])
+    found = _programme(available, sizes[:, None], wanted[None, :], np.array([1.0]))
+    reached = sizes @ found
+    if (reached != wanted).any():
+        if exact:
+            largest = sorted((int(n) for n in sizes), reverse=True)[:5]
+            asked, near = (
+                ", ".join(f"--{n} {int(c)}" for n, c in zip(names, values, strict=True))
+                for values in (wanted, reached)
+            )
+            raise ScenarioError(
+                f"{asked} is not possible: scenarios that share a trajectory, record or instruction stay "
+                f"together, and the largest groups have {', '.join(map(str, largest))}. The nearest is {near}"
+            )
+        wanted = reached.astype(float)
+    features, weights = [], []
+    for axis, key in _AXES.items():
+        values = sorted({key(s) for s in scenarios})
+        members = [Counter(key(scenarios[i]) for i in groups[0]) for groups in kinds]
+        features += [[m[value] for m in members] for value in values]
+        weights += [_JOINT_WEIGHT if axis == "cell, source and suite" else 1.0] * len(values)
+    matrix = np.array(features, dtype=float).T
+    expected = (available @ matrix)[:, None] * wanted[None, :] / max(wanted.sum(), 1.0)
+    return _programme(available, matrix, expected, np.array(weights), sizes=sizes, exactly=wanted)
+
+
+def _programme(
+    available: np.ndarray,
+    features: np.ndarray,
+    expected: np.ndarray,
+    weights: np.ndarray,
+    *,
+    sizes: np.ndarray | None = None,
+    exactly: np.ndarray | None = None,
+) -> np.ndarray:
+    """Distributes groups so that features lie as near to what is expected as can be.
+
+    What counts is the weighted distance from the whole numbers around the expected one.
+
+    Args:
+        available: (K,) groups of each kind.
+        features: (K, F) scenarios with each feature in a group of a kind.
+        expected: (F, S) scenarios with each feature wanted in each split.
+        weights: (F,) of the distances.
+        sizes: (K,) scenarios in a group of a kind.
+        exactly: (S,) scenarios that each split must have; needs `sizes`.
+
+    Returns:
+        (K, S) int.
+    """
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import block_array, eye_array, kron
+
+    kinds, count = features.shape
+    splits = expected.shape[1]
+    # Variables: groups (K * S), then distances (F * S).
+    per_kind = kron(eye_array(kinds), np.ones((1, splits)))
+    per_feature = kron(features.T, eye_array(splits))
+    slack = eye_array(count * splits)
+    rows = [[per_kind, None], [per_feature, -slack], [per_feature, slack]]
+    low = [available, np.full(count * splits, -np.inf), np.floor(expected.ravel() + 1e-9)]
+    high = [available, np.ceil(expected.ravel() - 1e-9), np.full(count * splits, np.inf)]
+    if exactly is not None:
+        rows.append([kron(sizes[None, :], eye_array(splits)), None])
+        low.append(exactly)
+        high.append(exactly)
+    cost = np.concatenate([np.zeros(kinds * splits), np.repeat(weights, splits)])
+    found = milp(
+        cost,
+        integrality=np.concatenate([np.ones(kinds * splits), np.zeros(count * splits)]),
+        bounds=Bounds(0, np.inf),
+        constraints=LinearConstraint(
+            block_array(rows, format="csc"), np.concatenate(low), np.concatenate(high)
+        ),
+        options={"node_limit": _NODES, "mip_rel_gap": 1e-3},
+    )
+    if found.x is None:
+        raise ScenarioError(
+            f"no division was found ({found.message}); ask for fractions, or for fewer kinds of splits"
+        )
+    return np.rint(found.x[: kinds * splits]).astype(int).reshape(kinds, splits)

@@ -1,0 +1,181 @@
+"""Writes splits into a scenario dataset, with a record of how they came about; and reports leakage."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover import __version__
+from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
+from lerobot_roborecover.curation.split import SplitConfig, apart_for, assign, groups_of, shared
+from lerobot_roborecover.datasets import write_scenarios
+from lerobot_roborecover.datasets.contents import list_files
+from lerobot_roborecover.datasets.frame_files import FrameStore
+from lerobot_roborecover.datasets.read import read_with_manifest
+from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.whole import new_folder, write_whole
+from lerobot_roborecover.words import counted
+
+SPLIT_FILE = "split.json"
+SCHEMA_VERSION = 1
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class SplitReport:
+    """What the splits of a set hold and share."""
+
+    counts: Mapping[str, int]
+    """Scenarios by split."""
+    apart: tuple[str, ...]
+    groups: int
+    """Of scenarios that stay together; a scenario on its own is one."""
+    largest_group: int
+    leaks: Mapping[str, Sequence[tuple[str, tuple[str, ...]]]]
+    """By key: what is shared across splits, and the ids that share it. Empty where nothing is."""
+    balance: Mapping[str, Mapping[str, Mapping[str, int]]]
+    """By axis and value: scenarios by split."""
+
+
+def split_dataset(
+    root: Path, config: SplitConfig, *, out: Path | None = None, dry_run: bool = False, force: bool = False
+) -> SplitReport:
+    """Divides a scenario dataset.
+
+    Args:
+        root: the dataset's folder.
+        config: sizes and seed.
+        out: where to write a divided copy; None changes the dataset itself, whose rows keep their order.
+        dry_run: only report.
+        force: divide anew what was divided otherwise before.
+
+    Raises:
+        ScenarioError: the sizes are impossible, or the dataset was divided before and results may rest on
+            that.
+    """
+    scenarios, manifest = read_with_manifest(root)
+    splits = assign(scenarios, config)
+    divided = [replace(s, split=splits[s.id]) for s in scenarios]
+    report = report_splits(divided, config.apart)
+    if any(report.leaks.values()):
+        raise AssertionError(f"groups were torn apart: {report.leaks}")
+    if dry_run:
+        return report
+    target = root
+    before = root / FOLDER / SPLIT_FILE
+    changed = [s.id for s, d in zip(scenarios, divided, strict=True) if s.split != d.split]
+    if out is None and before.is_file() and changed and not force:
+        raise ScenarioError(
+            f"{root} was divided before, and {len(changed)} scenarios would change their split, e.g. "
+            f"{changed[0]!r}: results on the old test split would no longer mean the same. Write a copy with "
+            "--out, or insist with --force"
+        )
+    if out is not None:
+        _copy(root, out)
+        target = out
+    frames = FrameStore(root)
+    write_scenarios(
+        target,
+        divided,
+        description=manifest.get("description", ""),
+        license=manifest.get("license"),
+        frames=(frames.of(s) for s in divided if s.id in frames),
+    )
+    _record(target, config, report, [s.id for s in divided])
+    return report
+
+
+def check_splits(root: Path, apart: tuple[str, ...] | None) -> SplitReport:
+    """Reports what the splits of a dataset share."""
+    return report_splits(read_with_manifest(root)[0], apart)
+
+
+def report_splits(scenarios: Sequence[Scenario], apart: tuple[str, ...] | None) -> SplitReport:
+    """What the splits of a set hold and share.
+
+    Args:
+        scenarios: with their splits.
+        apart: what no two splits may share; None takes what fits the platform.
+    """
+    keys = apart_for(scenarios, apart)
+    groups = groups_of(scenarios, keys)
+    leaks = {
+        key: [
+            (value, tuple(scenarios[i].id for i in members))
+            for value, members in sorted(values.items())
+            if len({scenarios[i].split for i in members}) > 1
+        ]
+        for key, values in shared(scenarios, keys).items()
+    }
+    axes = {
+        "cell": lambda s: s.cell,
+        "source": lambda s: s.source.value,
+        "suite": lambda s: s.task.suite,
+        "source policy": lambda s: s.source_policy or "none",
+    }
+    balance = {
+        axis: {
+            value: dict(Counter(s.split for s in scenarios if key(s) == value))
+            for value in sorted({key(s) for s in scenarios})
+        }
+        for axis, key in axes.items()
+    }
+    return SplitReport(
+        dict(sorted(Counter(s.split for s in scenarios).items())),
+        keys,
+        len(groups),
+        max(map(len, groups), default=0),
+        {key: found for key, found in leaks.items() if found},
+        balance,
+    )
+
+
+def format_report(report: SplitReport) -> str:
+    """The report as text."""
+    names = list(report.counts)
+    lines = [
+        f"{counted(sum(report.counts.values()), 'scenario')} in {counted(report.groups, 'group')}, "
+        f"the largest of {report.largest_group}; kept apart: {', '.join(report.apart)}",
+        f"{'':<34}" + "".join(f"{name:>10}" for name in names),
+        f"{'scenarios':<34}" + "".join(f"{report.counts[name]:>10}" for name in names),
+    ]
+    for axis, values in report.balance.items():
+        lines.append(axis)
+        for value, counts in values.items():
+            lines.append(f"  {value[:32]:<32}" + "".join(f"{counts.get(name, 0):>10}" for name in names))
+    for key in report.apart:
+        found = report.leaks.get(key, ())
+        lines.append(f"leakage by {key}: {len(found) or 'none'}")
+        for value, ids in found[:_SHOWN]:
+            lines.append(f"  {value[:60]}: {', '.join(ids[:_SHOWN])}{', ...' if len(ids) > _SHOWN else ''}")
+    return "\n".join(lines)
+
+
+def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[str]) -> None:
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "written_by": {"lerobot_env_roborecover": __version__},
+        "sizes": dict(config.sizes),
+        "seed": config.seed,
+        "kept_apart": list(report.apart),
+        "counts": dict(report.counts),
+        "groups": report.groups,
+    }
+    write_whole(root / FOLDER / SPLIT_FILE, json.dumps(document, indent=2) + "\n")
+    # A set that was not built here has no history to go on with.
+    if read_decisions(root):
+        record_decisions(root, (Decision(i, "split", "kept", by=f"seed {config.seed}") for i in ids))
+
+
+def _copy(root: Path, out: Path) -> None:
+    with new_folder(out) as folder:
+        for name in list_files(root):
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(root / name, target)

@@ -1,0 +1,221 @@
+"""LeRobot's writer of episodes, without its loss of frames.
+
+LeRobot 0.6.1 encodes while frames come in and throws a frame away when the encoder's queue of 30 has been
+full for 0.1 s (`StreamingVideoEncoder.feed_frame`), as befits a robot that does not wait. Here frames come
+from files and simulators, which do: a frame waits until there is room. When an episode ends, the frames that
+the encoder really wrote are counted against its steps. LeRobot is imported here, and this module only when
+something is written.
+"""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import StreamingVideoEncoder
+
+from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX, Frame, features_of
+from lerobot_roborecover.datasets.video_frames import REMEDY, check_frames
+from lerobot_roborecover.scenario import ScenarioError
+
+QUEUE = 30
+"""Frames of a camera that may wait for the encoder: some 6 MB at 256 x 256."""
+_LOOK_S = 1.0
+"""How often a waiting frame looks whether the encoder still lives."""
+
+
+class PatientEncoder(StreamingVideoEncoder):
+    """The streaming encoder, with frames that wait for room instead of being thrown away."""
+
+    def feed_frame(self, video_key: str, image: np.ndarray) -> None:
+        """Hands a frame over as soon as there is room.
+
+        Raises:
+            ScenarioError: the encoder has died.
+        """
+        # Full, LeRobot's own waits 0.1 s and drops; it is asked only once there is room, which nobody but
+        # this thread takes up.
+        self._put(video_key, np.array(image))
+
+    def finish_episode(self) -> dict[str, tuple[Path, dict | None]]:
+        """Ends the films; waits as long as the encoder works, where LeRobot gives up after two minutes.
+
+        Raises:
+            ScenarioError: the encoder has died.
+        """
+        for key, thread in self._threads.items():
+            self._put(key, None)
+            thread.join()
+        return super().finish_episode()
+
+    def _put(self, key: str, item: np.ndarray | None) -> None:
+        if not self._episode_active:
+            raise RuntimeError("no episode has begun; frames belong to one")
+        while True:
+            if not self._threads[key].is_alive():
+                raise ScenarioError(
+                    f"camera {key}: the video encoder died ({self._last_words(key)}); see that the disk has "
+                    "room and run it again"
+                )
+            try:
+                return self._frame_queues[key].put(item, timeout=_LOOK_S)
+            except queue.Full:
+                continue
+
+    def _last_words(self, key: str) -> str:
+        try:
+            return str(self._result_queues[key].get_nowait()[1])
+        except queue.Empty:
+            return "it left no message"
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode to be written, of T steps."""
+
+    name: str
+    """For messages, e.g. `scenario abc`."""
+    actions: np.ndarray
+    """(T, A) float64."""
+    frames: Iterable[Frame]
+    """T observations, one before each action."""
+    scenario_index: int
+    instruction: str
+    columns: Mapping[str, np.ndarray]
+    """Columns of its own, (T,) float32 each."""
+
+
+def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int], name: str) -> None:
+    """Joins LeRobotDatasets into a new one without encoding anything again, and counts its frames.
+
+    Args:
+        root: the new dataset's folder.
+        sources: in the order in which their episodes follow each other.
+        steps: of all episodes, in that order.
+        name: of the new dataset.
+
+    Raises:
+        ScenarioError: they do not fit together, or an episode's film has another number of frames than steps.
+    """
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    quiet_video()
+    try:
+        aggregate_datasets([f"roborecover/{s.name}" for s in sources], f"roborecover/{name}", sources, root)
+    except ValueError as err:
+        raise ScenarioError(f"the datasets cannot be joined: {err}") from err
+    check_frames(root, steps, thorough=True)
+
+
+def quiet_video() -> None:
+    """Errors only from FFmpeg's libraries, which report on every film that they open or close."""
+    import av
+
+    av.logging.set_libav_level(av.logging.ERROR)
+
+
+class EpisodeWriter:
+    """Writes episodes as a LeRobotDataset in a folder that does not exist yet.
+
+    Args:
+        root: the dataset's folder.
+        fps: frame rate.
+        robot_type: the platform.
+    """
+
+    def __init__(self, root: Path, fps: int, robot_type: str):
+        quiet_video()
+        self._root, self._fps, self._robot_type = root, fps, robot_type
+        self._dataset: Any = None
+        self._steps: list[int] = []
+
+    def write(self, episode: Episode) -> None:
+        """Writes an episode.
+
+        Raises:
+            ScenarioError: it has not one frame before each action, or a camera's film another number of
+                frames than that.
+        """
+        steps, written = len(episode.actions), 0
+        for frame in episode.frames:
+            if written == steps:
+                written += 1
+                break
+            if self._dataset is None:
+                self._dataset = self._create(episode, frame)
+            action = episode.actions[written]
+            own = {k: np.array([v[written]], dtype=np.float32) for k, v in episode.columns.items()}
+            self._dataset.add_frame(
+                {
+                    **frame,
+                    "action": action.astype(np.float32),
+                    EXACT_ACTION: action,
+                    SCENARIO_INDEX: np.array([episode.scenario_index], dtype=np.int64),
+                    "task": episode.instruction,
+                    **own,
+                }
+            )
+            written += 1
+        if written != steps or not written:
+            raise ScenarioError(
+                f"{episode.name}: {steps} actions, but {written if written <= steps else 'more'} frames; an "
+                "episode has one frame before each action, and at least one"
+            )
+        self._dataset.save_episode()
+        self._check_latest(episode.name, steps)
+        self._steps.append(steps)
+
+    def _create(self, episode: Episode, frame: Frame) -> Any:
+        features = features_of(frame, episode.actions.shape[1])
+        features |= {k: {"dtype": "float32", "shape": (1,), "names": None} for k in episode.columns}
+        dataset = LeRobotDataset.create(
+            repo_id=f"roborecover/{self._root.name.strip('.')}",
+            fps=self._fps,
+            features=features,
+            root=self._root,
+            robot_type=self._robot_type,
+            streaming_encoding=True,
+        )
+        theirs = dataset.writer._streaming_encoder
+        if theirs is not None:
+            dataset.writer._streaming_encoder = PatientEncoder(
+                theirs.fps,
+                theirs._rgb_encoder,
+                theirs._depth_encoder,
+                queue_maxsize=QUEUE,
+                encoder_threads=theirs._encoder_threads,
+            )
+        return dataset
+
+    def _check_latest(self, name: str, steps: int) -> None:
+        """The length of the film just written, which is where LeRobot begins the next one."""
+        latest = self._dataset.meta.latest_episode
+        for camera in self._dataset.meta.video_keys:
+            begin, end = (latest[f"videos/{camera}/{part}_timestamp"][0] for part in ("from", "to"))
+            frames = round((end - begin) * self._fps)
+            if frames != steps:
+                raise ScenarioError(
+                    f"{name} (episode {len(self._steps)}), camera {camera}: the encoder wrote {frames} video "
+                    f"frames for {steps} steps; {REMEDY}"
+                )
+
+    def close(self) -> None:
+        """Ends the dataset; without it the parquet files have no footer."""
+        if self._dataset is not None:
+            self._dataset.finalize()
+
+    def __enter__(self) -> EpisodeWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+        if kind is None and self._dataset is not None:
+            check_frames(self._root, self._steps, thorough=True)

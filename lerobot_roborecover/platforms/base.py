@@ -1,0 +1,425 @@
+"""Everything about a simulator family that is not physics; what is above knows platforms only through this.
+
+A platform is one subclass of `Platform` and one `Simulator`. Ours lie in the folders beside this file; those
+of other distributions are found through the entry-point group `roborecover.platforms` (docs/platforms.md).
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.platforms.names import nearest
+from lerobot_roborecover.platforms.simulator import Observation, Simulator, SimulatorError
+from lerobot_roborecover.scenario import Reset, ScenarioError, Task, TrialStart
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.platforms.controls import Controls
+    from lerobot_roborecover.platforms.findings import Check
+    from lerobot_roborecover.platforms.starts import Starts
+
+ENV_PREFIX = "roborecover_"
+"""Of the names under which LeRobot knows our env types."""
+
+type Driver = Callable[[int], np.ndarray]
+"""Next action, (A,) float64, for the given step; reads the simulator's present state."""
+
+
+@dataclass(frozen=True)
+class Expert:
+    """A scripted driver, for `roborecover collect --expert`."""
+
+    make: Callable[[Any, Task, np.random.Generator], Driver]
+    """From a simulator that was reset and has settled, the task, and the random stream of drivers that
+    draw."""
+    about: str
+    """A few words for a list of choices."""
+
+
+@dataclass(frozen=True)
+class SimulatorSetup:
+    """What a checked env config asks of the platform's simulator, and what of it decides results."""
+
+    options: Mapping[str, Any]
+    """Keyword options of the simulator; plain JSON values, because they travel to worker processes."""
+    decisive: Mapping[str, Any]
+    """Those that decide a result, for the trial rows."""
+    picture: Callable[[dict], np.ndarray] | None = None
+    """Upright frame (H, W, 3) uint8 of an observation, for LeRobot's videos; None asks the simulator."""
+    assets: Mapping[str, str] = field(default_factory=dict)
+    """Hashes of assets that decide the physics, under the names a fingerprint gives them."""
+    control_mode: str | None = None
+    """How actions after the handoff are read, for simulators that have more than one way."""
+    approximate_snapshots: bool = False
+    """Use snapshots also where what follows them drifts from a replay."""
+
+
+class Platform:
+    """One simulator family. Subclass it, set the attributes, and override what the defaults do not fit.
+
+    Nothing here imports a simulator, LeRobot or torch before it is asked for: the list of platforms is read
+    by every command and by every worker process.
+    """
+
+    name: ClassVar[str]
+    """Lower-case; the env type is `roborecover_<name>`, the Gymnasium id `roborecover/<Name>-v0`."""
+    title: ClassVar[str]
+    """For people, e.g. `LIBERO`."""
+    action_widths: ClassVar[tuple[int, ...]]
+    """Values in a recorded action; more than one where the platform has several kinds of actions."""
+    control_hz: ClassVar[float]
+    """Control steps a second."""
+    action_bound: ClassVar[float] = 1.0
+    """Largest |value| of an action that the simulator does not cut; infinite for joint targets."""
+    action_names: ClassVar[Mapping[int, tuple[str, ...]]] = {}
+    """By action width: what each value is, for people; names that end with `gripper` command grippers."""
+    axis_angle: ClassVar[Mapping[int, tuple[int, ...]]] = {}
+    """By width of a policy's state: which values are an axis-angle of robosuite's quaternion."""
+    records_control_mode: ClassVar[str | None] = None
+    """The env option `control_mode` that recorded actions are of; None where they can be of any."""
+    settle_steps: ClassVar[int] = 0
+    """Actions at a rollout's start that only let the scene settle; they belong to its prefix."""
+    clustered: ClassVar[bool] = False
+    """Several scenarios come of one trajectory: statistics resample trajectories, not scenarios."""
+    apart: ClassVar[tuple[str, ...]] = ("trajectory", "record")
+    """What may not lie on both sides of a split (`roborecover split`), where nobody says otherwise."""
+    turned_pictures: ClassVar[bool] = False
+    """Observed pictures leave the simulator rotated by 180 degrees."""
+    sizes_pictures: ClassVar[bool] = True
+    """`picture_options` decides how large pictures are; elsewhere a task's own configuration does."""
+    required_versions: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Distributions on which scores depend, and the versions whose scores can be compared."""
+    extra: ClassVar[str] = ""
+    """Of the distribution that brings the platform's packages, e.g. `libero`; empty where none is needed."""
+    distribution: ClassVar[str] = "lerobot_env_roborecover"
+    """What installs the platform."""
+    simulator: ClassVar[str]
+    """`module:Class` of the simulator, imported where one is made."""
+    default_scenarios: ClassVar[str] = ""
+    """Scenario set that the env type takes where none is named: a shipped set, Hub id or folder."""
+    experts: ClassVar[Mapping[str, Expert]] = {}
+    """Scripted drivers by name."""
+    perturbable: ClassVar[bool] = True
+    """Actions begin with normalised translations that `collect --perturb` can disturb."""
+    why_not_perturbable: ClassVar[str] = ""
+
+    def grippers(self, width: int) -> tuple[int, ...]:
+        """Which values of an action command grippers.
+
+        Args:
+            width: values in an action.
+        """
+        return tuple(i for i, n in enumerate(self.action_names.get(width, ())) if n.endswith("gripper"))
+
+    # --- tasks
+
+    def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
+        """Every task, in the catalogue's order.
+
+        Args:
+            options: of the simulator, where the catalogue depends on them.
+
+        Raises:
+            SimulatorError: what the catalogue is read from is not installed.
+        """
+        raise NotImplementedError
+
+    def task(self, name: str, instruction: str = "", suite: str = "") -> Task:
+        """A task by its name.
+
+        Args:
+            name: the platform's own task name.
+            instruction: as recorded; by default the platform's own.
+            suite: needed only where several have a task of this name.
+
+        Raises:
+            ScenarioError: there is no such task, or there are several.
+        """
+        found = [t for t in self.tasks() if t.name == name and suite in ("", t.suite)]
+        if not found:
+            there = {t.name for t in self.tasks() if suite in ("", t.suite)}
+            of = f" in suite {suite!r:.80}" if suite else ""
+            raise ScenarioError(f"{self.name} has no task {name!r:.120}{of}{nearest(name, there)}")
+        if len(found) > 1:
+            suites = ", ".join(t.suite for t in found)
+            raise ScenarioError(
+                f"{len(found)} suites of {self.name} have a task {name!r:.120} ({suites}): name the suite"
+            )
+        said = instruction or found[0].instruction
+        return Task(self.name, found[0].suite, found[0].name, said, found[0].horizon)
+
+    def task_by_instruction(self, instruction: str, suite: str = "") -> Task:
+        """A task by its instruction, letter case and spaces aside.
+
+        Raises:
+            ScenarioError: no task has it, or several have.
+        """
+        wanted = _plain(instruction)
+        found = [t for t in self.tasks() if _plain(t.instruction) == wanted and suite in ("", t.suite)]
+        if len(found) != 1:
+            raise ScenarioError(
+                f"{len(found)} tasks of {self.name} have the instruction {instruction!r:.120}"
+                + (f": {', '.join(f'{t.suite}/{t.name}' for t in found)}" if found else "")
+                + "; name the task (--task NAME) or the suite (--suite)"
+            )
+        return self.task(found[0].name, instruction, found[0].suite)
+
+    def check_task(self, task: Task) -> None:
+        """Refuses a task that the platform does not have.
+
+        Raises:
+            ScenarioError: unknown suite or task; names the nearest ones.
+            SimulatorError: what the catalogue is read from is not installed.
+        """
+        suites: dict[str, set[str]] = defaultdict(set)
+        for known in self.tasks():
+            suites[known.suite].add(known.name)
+        if task.suite not in suites:
+            raise ScenarioError(f"{self.name} has no suite {task.suite!r}; there are {', '.join(suites)}")
+        if task.name not in suites[task.suite]:
+            elsewhere = [s for s, names in suites.items() if task.name in names]
+            hint = (
+                f"; it is a task of {elsewhere[0]}" if elsewhere else nearest(task.name, suites[task.suite])
+            )
+            raise ScenarioError(f"{self.name} suite {task.suite} has no task {task.name!r}{hint}")
+
+    def check_scenario(self, scenario: TrialStart) -> None:
+        """Refuses a scenario whose actions the platform cannot execute.
+
+        Raises:
+            ScenarioError: the prefix has another width.
+        """
+        self.check_width(scenario.prefix.shape[1], f"scenario {scenario.id}")
+
+    def check_width(self, width: int, where: str) -> None:
+        """Refuses recorded actions of another width.
+
+        Args:
+            width: values in an action.
+            where: the beginning of the message.
+
+        Raises:
+            ScenarioError: the platform has no actions of this width.
+        """
+        if width not in self.action_widths:
+            raise ScenarioError(
+                f"{where}: prefix actions have width {width}; platform {self.name} takes "
+                f"{' or '.join(map(str, self.action_widths))}"
+            )
+
+    def rewind_steps(self, horizon: int) -> int:
+        """Steps that Reversion goes back where nobody says otherwise (paper, "Intervention Results").
+
+        Args:
+            horizon: S of the task.
+        """
+        return 30
+
+    # --- where rollouts start
+
+    def resets(self, task: Task, starts: Starts) -> list[Reset]:
+        """A task's resets, in the order listed or drawn.
+
+        Raises:
+            ScenarioError: the platform has other starts, or not as many.
+        """
+        return starts.by_seed(task, self.settle_steps)
+
+    def first_reset(self, task: Task, seed: int | None = None, init_state: int | None = None) -> Reset:
+        """One reset of a task, by default its first.
+
+        Raises:
+            ScenarioError: the platform has no init states.
+        """
+        if init_state is not None:
+            raise ScenarioError(f"{self.name} has no init states; its tasks are laid out by a seed")
+        return Reset(seed=0 if seed is None else seed)
+
+    def another_reset(self, task: Task, number: int) -> Reset:
+        """A reset of a task that differs from the first.
+
+        Args:
+            task: whose.
+            number: 1 for the second start, and so on.
+        """
+        return self.first_reset(task, seed=number)
+
+    def random_actions(self, rng: np.random.Generator, steps: int, width: int) -> np.ndarray:
+        """(steps, width) float64 that move the robot about without harm, for `check-platform`."""
+        return rng.uniform(-1.0, 1.0, (steps, width)) * min(self.action_bound, 1.0)
+
+    def no_op(self) -> np.ndarray:
+        """(A,) float64 that keeps the robot where it is while the scene settles."""
+        return np.zeros(self.action_widths[0])
+
+    def cannot_drive(self, task: Task) -> str:
+        """Why the scripted drivers cannot do a task at all; empty where they can try."""
+        return ""
+
+    def short_name(self, task: Task) -> str:
+        """Of a task, for the ids of its rollouts."""
+        return task.name
+
+    # --- simulator and observations
+
+    def make_simulator(self, **options: Any) -> Simulator:
+        """Makes the simulator.
+
+        Args:
+            options: its own keyword options.
+
+        Raises:
+            SimulatorError: a package that it needs is not installed, or an option cannot be used.
+        """
+        module, _, name = self.simulator.partition(":")
+        try:
+            cls = getattr(importlib.import_module(module), name)
+        except ModuleNotFoundError as err:
+            raise SimulatorError(
+                f"platform {self.name!r} needs the package {err.name!r}, which is not installed. "
+                f"Install it with: {self.install_command}"
+            ) from err
+        return cls(**options)
+
+    @property
+    def install_command(self) -> str:
+        """What installs the platform's packages."""
+        return f"pip install '{self.distribution}{f'[{self.extra}]' if self.extra else ''}'"
+
+    def action_space(self, width: int) -> gym.spaces.Box:
+        """What a policy may give the simulator.
+
+        Args:
+            width: values in an action.
+        """
+        return gym.spaces.Box(-self.action_bound, self.action_bound, (width,), np.float32)
+
+    def policy_action_width(self, options: Mapping[str, Any], recorded: int) -> int:
+        """Values in a policy's action.
+
+        Args:
+            options: of the simulator.
+            recorded: values in the scenario's recorded actions.
+        """
+        return recorded
+
+    def picture_options(self, size: int) -> dict[str, Any]:
+        """Simulator options for square pictures.
+
+        Args:
+            size: side in pixels; 0 for none.
+        """
+        if not size:
+            return {"obs_type": "state"}
+        return {"obs_type": "pixels_agent_pos", "observation_height": size, "observation_width": size}
+
+    def upright(self, picture: np.ndarray) -> np.ndarray:
+        """An observed picture (H, W, 3) as people, and policies behind LeRobot's processors, see it."""
+        return picture[::-1, ::-1] if self.turned_pictures else picture
+
+    def process_observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """LeRobot's own processing of the platform's observations, after `preprocess_observation`."""
+        return observation
+
+    def gripper_closed(self, state: np.ndarray) -> bool:
+        """Whether the gripper is to stay closed, by the (D,) `observation.state` of a policy: whoever takes
+        over must not drop what the policy holds."""
+        return False
+
+    def owns_observation(self, observation: Mapping[str, tuple[int, ...]]) -> bool:
+        """Whether a policy's observation, by the shapes of its entries, is this platform's."""
+        return False
+
+    # --- people
+
+    def controls(self) -> Controls:
+        """How a person drives it.
+
+        Raises:
+            ScenarioError: it cannot be driven by hand; says why.
+        """
+        raise ScenarioError(f"{self.title} cannot be driven by hand: nobody has said what the keys mean")
+
+    # --- LeRobot
+
+    def env_config(self) -> type:
+        """LeRobot's `EnvConfig` of the platform: a dataclass with `simulator_setup() -> SimulatorSetup`,
+        which raises `OptionError` for what cannot be used. Imports LeRobot. The options of recovery
+        evaluation (`RecoveryOptions`) are added to it where it is registered."""
+        raise NotImplementedError
+
+    # --- the machine
+
+    def examine(self, required: bool, recorded: Mapping[str, str]) -> list[Check]:
+        """The doctor's checks of what the platform needs beside packages: assets, drivers, checkouts.
+
+        Args:
+            required: what is missing is a failure rather than a warning.
+            recorded: what recorded the platform's shipped set, by name of the package or file
+                (`Fingerprint.versions`); empty where there is none to compare with.
+        """
+        return []
+
+    def salt(self, options: Mapping[str, Any]) -> dict[str, str | None]:
+        """What else of this machine decides a replay: folders of assets, named by options or environment."""
+        return {}
+
+    def __repr__(self) -> str:
+        return f"<platform {self.name}>"
+
+
+def refuse_unused(config: object, base: type, names: tuple[str, ...]) -> None:
+    """Refuses options that LeRobot's own env has and a scenario settles by itself.
+
+    Args:
+        config: what was parsed.
+        base: LeRobot's own dataclass.
+        names: of its options.
+
+    Raises:
+        OptionError: one of them was given.
+    """
+    defaults = {f.name: f.default for f in fields(base)}
+    for name in names:
+        if getattr(config, name) != defaults[name]:
+            raise OptionError(
+                f"--env.{name}={getattr(config, name)}: the scenario decides this. "
+                "Choose scenarios with --env.select"
+            )
+
+
+def check_quality(quality: str) -> None:
+    """Refuses a `render_quality` that MuJoCo platforms do not have.
+
+    Raises:
+        OptionError: naming those that there are.
+    """
+    if quality not in ("full", "fast"):
+        raise OptionError(f"--env.render_quality={quality}: not one of full, fast")
+
+
+def chosen_quality(quality: str) -> dict[str, str]:
+    """Left out where it is LeRobot's: trials from before there was a choice keep their identity."""
+    return {} if quality == "full" else {"render_quality": quality}
+
+
+def no_video(_: Observation) -> np.ndarray:
+    """Frame of a video nobody asked for: grey, so that it is not mistaken for a dark scene."""
+    return np.full((64, 64, 3), 128, np.uint8)
+
+
+def first_camera(observation: Observation) -> np.ndarray:
+    """The picture of an observation, or of its first camera."""
+    pixels = observation["pixels"]
+    return next(iter(pixels.values())) if isinstance(pixels, Mapping) else pixels
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.lower().split())

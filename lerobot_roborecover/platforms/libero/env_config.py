@@ -1,0 +1,96 @@
+"""LeRobot's configuration of LIBERO, and what a recovery run adds to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from lerobot.envs.configs import LiberoEnv
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.platforms.base import (
+    SimulatorSetup,
+    check_quality,
+    chosen_quality,
+    first_camera,
+    no_video,
+    refuse_unused,
+)
+from lerobot_roborecover.platforms.lerobot_features import drop_pictures
+
+
+@dataclass
+class LiberoConfig(LiberoEnv):
+    """Recovery scenarios on LIBERO."""
+
+    assets_dir: str = ""
+    """LIBERO's asset folder; empty: `$ROBORECOVER_LIBERO_ASSETS`, LIBERO's own configuration, then the
+    Hub."""
+    render_quality: str = "full"
+    """`full`, as LeRobot renders; or `fast`, without shadows, reflections and smoothing and with a coarser
+    robot, some six times as fast where there is no GPU. Other pictures, so another experiment for a policy
+    that looks at them; the physics is the same."""
+
+    def processors_for(self, policy_cfg: Any) -> None:
+        """LeRobot's choice is right here."""
+
+    def __post_init__(self):
+        if self.obs_type == "state":  # robot state alone, for policies that look at nothing
+            self.obs_type = "pixels_agent_pos"  # the nearest that LeRobot's own config knows
+            super().__post_init__()
+            self.obs_type = "state"
+            drop_pictures(self)
+        else:
+            super().__post_init__()
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """Options of the simulator."""
+        return {
+            "assets_dir": self.assets_dir or None,
+            "observation_height": self.observation_height,
+            "observation_width": self.observation_width,
+            "camera_name": self.camera_name,
+            "camera_name_mapping": self.camera_name_mapping,
+            "obs_type": self.obs_type,
+            "fps": self.fps,
+            **chosen_quality(self.render_quality),
+        }
+
+    def simulator_setup(self) -> SimulatorSetup:
+        """The options, checked.
+
+        Raises:
+            OptionError: one cannot be used.
+            SimulatorError: LIBERO's assets are missing.
+        """
+        from lerobot_roborecover.platforms.libero.assets import find_assets, physics_hash
+
+        refuse_unused(
+            self,
+            LiberoEnv,
+            ("task", "task_ids", "init_states", "hard_reset", "is_libero_plus", "episode_length"),
+        )
+        check_quality(self.render_quality)
+        if self.fps != 20:
+            raise OptionError(f"--env.fps={self.fps}: recorded prefixes are of 20 Hz")
+        if self.control_mode not in ("relative", "absolute"):
+            raise OptionError(f"--env.control_mode={self.control_mode}: not one of ['relative', 'absolute']")
+        assets = find_assets(self.assets_dir or None)
+        options = {**self.gym_kwargs, "assets_dir": str(assets)}
+        decisive = {k: v for k, v in options.items() if k != "assets_dir"}
+        picture = _upright
+        if self.obs_type == "state":
+            picture = None if self.videos else no_video
+        return SimulatorSetup(
+            options,
+            decisive | {"control_mode": self.control_mode},
+            picture,
+            assets={"libero_assets": physics_hash(assets)},
+            control_mode=self.control_mode,
+        )
+
+
+def _upright(observation: dict[str, Any]) -> np.ndarray:
+    return first_camera(observation)[::-1, ::-1]

@@ -1,0 +1,145 @@
+"""What LIBERO's scripted driver knows: geometry, grasps and goals, from privileged simulator state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+from lerobot_roborecover.platforms.mujoco_state import subtree
+
+PICK_AND_PLACE = ("on", "in")
+"""Predicates of a goal that the driver knows."""
+_BOX = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+_COLLISION_GROUP = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One `On` or `In` predicate of a task's goal."""
+
+    predicate: tuple[str, ...]
+    """As LIBERO parsed it."""
+    item: str
+    """Object to be moved."""
+    region: str
+    """Object or region where it belongs."""
+
+
+class LiberoScene:
+    """The scene of the task that a simulator was last reset to; made anew after every reset.
+
+    Args:
+        simulator: after `reset`.
+    """
+
+    def __init__(self, simulator: LiberoSimulator):
+        self.env = simulator.libero_env
+        self._model, self._data = self.env.sim.model._model, self.env.sim.data._data
+        self._robot = self.env.robots[0]
+
+    @cached_property
+    def goals(self) -> list[Goal]:
+        """The goal's pick-and-place predicates, in LIBERO's order."""
+        state = self.env.parsed_problem["goal_state"]
+        return [Goal(tuple(p), p[1], p[2]) for p in state if p[0] in PICK_AND_PLACE]
+
+    def reached(self, goal: Goal) -> bool:
+        """LIBERO's own verdict on one predicate."""
+        return bool(self.env._eval_predicate(goal.predicate))
+
+    @property
+    def objects(self) -> list[str]:
+        """Names of the objects that can be moved about."""
+        return list(self.env.objects_dict)
+
+    @property
+    def hand_m(self) -> np.ndarray:
+        """(3,) float64 metres: the grip site."""
+        return self._data.site_xpos[self._robot.eef_site_id].copy()
+
+    @property
+    def hand_rotation(self) -> np.ndarray:
+        """(3, 3) float64 of the grip site."""
+        return self._data.site_xmat[self._robot.eef_site_id].reshape(3, 3).copy()
+
+    @property
+    def closing_axis(self) -> np.ndarray:
+        """(2,) float64 unit vector in the table plane along which the fingers close."""
+        left, right = (self._data.body(f"gripper0_{side}finger").xpos for side in ("left", "right"))
+        axis = (left - right)[:2]
+        return axis / max(np.linalg.norm(axis), 1e-6)
+
+    def holds(self, name: str) -> bool:
+        """Whether both fingers touch an object."""
+        return bool(self.env._check_grasp(self._robot.gripper, self.env.get_object(name)))
+
+    def position_m(self, name: str) -> np.ndarray:
+        """(3,) float64 metres: an object's or fixture's body."""
+        return self._data.xpos[self.env.obj_body_id[name]].copy()
+
+    def upright(self, name: str) -> float:
+        """Cosine of the angle between an object's own z axis and the vertical."""
+        return float(self._data.xmat[self.env.obj_body_id[name]][8])
+
+    def cloud_m(self, name: str) -> np.ndarray:
+        """(n, 3) float64 metres: corners of an object's collision geometry in the world."""
+        points = []
+        for geom in self._collision_geoms(name):
+            kind, size = self._model.geom_type[geom], self._model.geom_size[geom]
+            if kind == mujoco.mjtGeom.mjGEOM_MESH:
+                mesh = self._model.geom_dataid[geom]
+                start = self._model.mesh_vertadr[mesh]
+                local = self._model.mesh_vert[start : start + self._model.mesh_vertnum[mesh]]
+            else:
+                half = {
+                    mujoco.mjtGeom.mjGEOM_BOX: size,
+                    mujoco.mjtGeom.mjGEOM_CYLINDER: [size[0], size[0], size[1]],
+                    mujoco.mjtGeom.mjGEOM_SPHERE: [size[0]] * 3,
+                }.get(kind, [size[0], size[0], size[0] + size[1]])
+                local = _BOX * half
+            points.append(self._data.geom_xpos[geom] + local @ self._data.geom_xmat[geom].reshape(3, 3).T)
+        return np.concatenate(points)
+
+    def center_m(self, region: str) -> np.ndarray:
+        """(3,) float64 metres: a region's middle, or the top of an object's."""
+        if region in self.env.object_sites_dict:
+            return np.array(self.env.sim.data.get_site_xpos(region))
+        cloud = self.cloud_m(region)
+        return np.array([*self.position_m(region)[:2], cloud[:, 2].max()])
+
+    def rim_m(self, region: str) -> float:
+        """Height of the highest thing that an object must clear on its way into a region, metres."""
+        if region in self.env.obj_body_id:
+            return float(self.cloud_m(region)[:, 2].max())
+        parent = self.env.object_sites_dict[region].__dict__.get("parent_name")
+        if parent in self.env.obj_body_id and "contain" in region:
+            return float(self.cloud_m(parent)[:, 2].max())
+        return float(self.center_m(region)[2])
+
+    def support_m(self, point_m: np.ndarray, ignore: str) -> float:
+        """Height of the first collision geometry under a point, an object and the robot left out; metres."""
+        left_out = subtree(self._model, [self.env.obj_body_id[ignore], *self._robot_roots])
+        origin, geom = np.array(point_m, dtype=np.float64), np.zeros(1, dtype=np.int32)
+        down = np.array([0.0, 0.0, -1.0])
+        for _ in range(60):
+            distance = mujoco.mj_ray(self._model, self._data, origin, down, _COLLISION_GROUP, 1, -1, geom)
+            if distance < 0:
+                return -np.inf
+            origin[2] -= distance
+            if int(self._model.geom_bodyid[geom[0]]) not in left_out:
+                return float(origin[2])
+            origin[2] -= 1e-3
+        return float(origin[2])
+
+    @cached_property
+    def _robot_roots(self) -> list[int]:
+        return [self._model.body(self._robot.robot_model.root_body).id]
+
+    def _collision_geoms(self, name: str) -> np.ndarray:
+        bodies = subtree(self._model, [self.env.obj_body_id[name]])
+        inside = np.isin(self._model.geom_bodyid, list(bodies))
+        return np.flatnonzero(inside & (self._model.geom_contype > 0))

@@ -1,0 +1,86 @@
+"""The one protocol behind every platform; everything above the platforms knows only this."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.scenario import Pose, Reset, Task
+
+type Observation = dict[str, Any]
+"""LeRobot's raw observation of the platform: nested dicts of arrays, before any processor."""
+
+HANDLE, GOAL = ".handle", "goal"
+"""Names of marks among the bodies; see `Simulator.bodies`."""
+
+
+class SimulatorError(RoboRecoverError, RuntimeError):
+    """The simulator cannot do what was asked; the message says what, why and the remedy."""
+
+
+class Simulator(Protocol):
+    """A task simulator whose resets and replays are exact.
+
+    Constructed with keyword options that are plain JSON values, so that they can travel to a worker process.
+    A simulator is never shared between threads or processes, and imports neither LeRobot nor torch if it can
+    help it.
+    """
+
+    platform: str
+    control_hz: float
+    action_dim: int
+    observation_space: gym.spaces.Dict
+    snapshot_is_exact: bool
+    """A restored snapshot continues bit-identically to a replay."""
+
+    def reset(self, task: Task, reset: Reset) -> None:
+        """Puts the task in its exact first state; rebuilds the model only when the task's model changes."""
+
+    def step(self, action: np.ndarray) -> None:
+        """Advances one control step; renders nothing, and is bit-identical to a step that renders.
+
+        Args:
+            action: (action_dim,), float64 or float32 exactly as recorded or as the policy gave it; never
+                clipped here.
+        """
+
+    def observe(self) -> Observation:
+        """The observation after the last step or reset, as LeRobot's own env of the platform gives it."""
+
+    def render(self) -> np.ndarray:
+        """(H, W, 3) uint8 upright picture of the scene for people, of the last step or reset."""
+
+    def succeeded(self) -> bool:
+        """The task's own success predicate, nothing else."""
+
+    def bodies(self) -> dict[str, Pose]:
+        """World poses; names that start with `eef` are end effectors, the rest whatever else can move.
+
+        A platform may add two marks without a direction of their own: `<body>` + `HANDLE`, the point of a
+        body that the task is about, and `GOAL`, where the task wants that point.
+        """
+
+    def state_sha256(self) -> str:
+        """SHA-256 of the complete integration state."""
+
+    def snapshot(self) -> bytes:
+        """The complete state, to be restored on a simulator that was reset to the same task and reset."""
+
+    def restore(self, snapshot: bytes) -> None:
+        """Puts a snapshot back. Where snapshots are exact, observations are valid only after a further
+        `step`."""
+
+    def fixtures(self) -> Mapping[str, Pose]:
+        """Fixture poses of the current reset that a scenario's `Reset` must carry; empty where there are
+        none."""
+
+    def fingerprint(self) -> dict[str, str]:
+        """Package and asset versions that decide the physics, and the robot (`robot_fingerprint`) where the
+        user brings its files."""
+
+    def close(self) -> None:
+        """Frees the simulator; further calls are undefined."""

@@ -1,0 +1,101 @@
+"""The report of stored outcomes: a study's tables again from `outcomes.csv`, without a trial being run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.env.trial_log import Protocol, make_row
+from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.study.arms import Arm, arms
+from lerobot_roborecover.study.definition import StudyDefinition
+from lerobot_roborecover.study.outcomes import read_outcomes
+from lerobot_roborecover.whole import write_whole
+
+
+def write_stored_logs(study: StudyDefinition, out: Path) -> list[Arm]:
+    """Writes the stored outcomes as trial logs, one an arm.
+
+    What `outcomes.csv` does not say is not in them: times, handoff errors, when an intervention acted.
+
+    Args:
+        study: what.
+        out: folder; its own, never that of a run.
+
+    Returns:
+        The arms.
+
+    Raises:
+        ScenarioError: nothing is stored, or an outcome is of no scenario of the study.
+    """
+    if not study.outcomes.exists():
+        raise ScenarioError(f"{study.root} has no stored outcomes; run the study without --stored")
+    stored = read_outcomes(study.outcomes)
+    dataset = load_scenarios(study.scenarios, split=study.split)
+    scenarios = {s.id: s for s in dataset}
+    found = list(arms(study, out))
+    by_label: dict[str, list[str]] = {arm.label: [] for arm in found}
+    names = {arm.label: arm for arm in found}
+    for (label, scenario_id, trial), (outcome, steps) in sorted(stored.items()):
+        if label not in names or scenario_id not in scenarios or outcome not in list(Outcome):
+            raise ScenarioError(
+                f"{study.outcomes}: {label} {scenario_id} {outcome} is no outcome of this study's arms and "
+                "scenarios; it was stored by another version of it. Run the study without --stored"
+            )
+        arm = names[label]
+        row = make_row(
+            scenarios[scenario_id],
+            Protocol(arm.start, 0, arm.name, None, None, dict(study.env)),
+            dataset=study.root.name,
+            dataset_revision=None,
+            trial=trial,
+            noise="unseeded",
+            batch_size=1,
+            outcome=Outcome(outcome),
+            reason="" if Outcome(outcome).valid else "stored without its reason",
+            steps=steps,
+            handoff=None,
+            sim_s=0.0,
+            policy_s=0.0,
+            actions_sha256="",
+        )
+        by_label[label].append(json.dumps(asdict(row)))
+    for arm in found:
+        write_whole(arm.log, "".join(f"{line}\n" for line in by_label[arm.label]))
+    return found
+
+
+def summary_table(done: Sequence[Arm]) -> str:
+    """The policies' rates as Markdown: the table of README.md and docs/study.md.
+
+    Args:
+        done: arms with logs.
+    """
+    from lerobot_roborecover.analysis.logs import read_study
+    from lerobot_roborecover.analysis.report_tables import overall
+    from lerobot_roborecover.analysis.results import Options, analyse
+    from lerobot_roborecover.analysis.tables import Table, to_markdown
+
+    policies = [arm for arm in done if arm.start == "initial"]
+    names = {arm.name for arm in policies}
+    logs = [f"{arm.name}={arm.log}" for arm in done if arm.name in names]
+    results = analyse(read_study(logs), Options())
+    whole = overall(results)
+    wanted = [
+        i
+        for i, column in enumerate(whole.columns)
+        if column.title.startswith(("Policy", "Initial", "RSR %", "Macro", "Retention"))
+        and "without" not in column.title
+    ]
+    order = [results.ranked.arms[p] for p in results.best_first]
+    rows = sorted(whole.rows, key=lambda row: order.index(row[0]) if row[0] in order else len(order))
+    table = Table(
+        "overall",
+        "The study's policies",
+        tuple(whole.columns[i] for i in wanted),
+        tuple(tuple(row[i] for i in wanted) for row in rows),
+    )
+    return to_markdown(table)

@@ -1,0 +1,123 @@
+"""A policy with its processors, as `lerobot-eval` loads them, behind the engine's one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.processors import env_processors
+from lerobot_roborecover.policies.host import Host
+from lerobot_roborecover.policies.policy_host import PolicyHost
+from lerobot_roborecover.trials.load_problems import load_remedy, other_action_width
+from lerobot_roborecover.trials.portable import make_portable
+
+
+@dataclass(frozen=True)
+class HostSpec:
+    """What a policy host is made from."""
+
+    policy: Any
+    """The policy's configuration (`PreTrainedConfig`), options applied."""
+    env: Any
+    """A recovery env config, which says what is observed."""
+    rename_map: Mapping[str, str] = field(default_factory=dict)
+    """The env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`."""
+    seed: int | None = 1000
+    """Of the run."""
+    max_batch: int = 64
+    """Observations per inference, at most."""
+    portable: bool = False
+    """See `runner.RunnerOptions.portable`."""
+
+
+def policy_config(policy: str, options: Sequence[str] = (), device: str | None = None) -> Any:
+    """A checkpoint's own config.
+
+    Args:
+        policy: folder or Hub id of the checkpoint.
+        options: `--name=value` or `name=value` options of it.
+        device: of the policy; None takes what the config says.
+
+    Raises:
+        OptionError: there is no such checkpoint.
+    """
+    import lerobot.policies  # noqa: F401 - registers LeRobot's policy types
+    from lerobot.configs.policies import PreTrainedConfig
+
+    from lerobot_roborecover.interventions import configuration_intervention  # noqa: F401 - and ours
+    from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
+    from lerobot_roborecover.remote import configuration_remote  # noqa: F401
+
+    find_file(policy, CONFIG_FILE)
+    overrides = [f"--{o.removeprefix('--')}" for o in options]
+    overrides += [f"--device={device}"] if device else []
+    config = PreTrainedConfig.from_pretrained(policy, cli_overrides=overrides)
+    config.pretrained_path = Path(policy)
+    return config
+
+
+def load_host(spec: HostSpec) -> Host:
+    """Loads the policy and its processors.
+
+    Raises:
+        OptionError: the checkpoint is for another robot, or lacks its processor files.
+    """
+    width = spec.env.features["action"].shape[0]
+    other = other_action_width(spec.policy, width)
+    if other is not None:
+        raise OptionError(
+            f"--policy.path={spec.policy.pretrained_path}: its actions have {other} values, {spec.env.type} "
+            f"takes {width}. The checkpoint is for another robot or another kind of action"
+        )
+    try:
+        return _load_host(spec)
+    except Exception as err:
+        remedy = load_remedy(err)
+        if not remedy:
+            raise
+        raise OptionError(
+            f"--policy.path={spec.policy.pretrained_path}: {err}. What to do: {remedy}"
+        ) from err
+
+
+def _load_host(spec: HostSpec) -> Host:
+    register_third_party_plugins()
+    torch.backends.cudnn.benchmark = True
+    torch.backends.cuda.matmul.allow_tf32 = True
+    set_seed(spec.seed)
+    rename_map = dict(spec.rename_map)
+    policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
+    policy.eval()
+    if spec.portable:
+        make_portable(policy)
+    preprocessor, postprocessor = load_processors(policy.config, spec)
+    env_pre, env_post = env_processors(spec.env, spec.policy)
+    if hasattr(policy, "make_host"):  # a composite policy keeps histories of its own
+        return policy.make_host(env_pre, env_post, preprocessor, spec.max_batch)
+    return PolicyHost(policy, env_pre, env_post, preprocessor, postprocessor, spec.max_batch)
+
+
+def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
+    """A policy's pre- and postprocessor, from where its checkpoint is.
+
+    Args:
+        config: of the loaded policy, which knows its device.
+        spec: of the host.
+    """
+    overrides = {
+        "device_processor": {"device": str(config.device)},
+        "rename_observations_processor": {"rename_map": dict(spec.rename_map)},
+    }
+    return make_pre_post_processors(
+        policy_cfg=spec.policy,
+        pretrained_path=spec.policy.pretrained_path,
+        preprocessor_overrides=overrides,
+    )

@@ -1,0 +1,62 @@
+"""The local engine: simulators in worker processes of this machine, the policy in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import wait
+from typing import Any
+
+from lerobot_roborecover.env.run import Run
+from lerobot_roborecover.policies.host import Host, InlineReplica
+from lerobot_roborecover.trials.engine import Engine, unfinished
+from lerobot_roborecover.trials.smoke import check_smoke
+from lerobot_roborecover.trials.units import Unit, first_units
+
+
+class LocalEngine(Engine):
+    """Runs units on worker slots of the run's pool.
+
+    Args:
+        run: pool, protocol, trial log.
+        host: the policy.
+        slots: how many simulators.
+        options: of `Engine`.
+    """
+
+    def __init__(self, run: Run, host: Host, *, slots: int, **options: Any):
+        super().__init__(run, run.pool.slots(slots), [InlineReplica(host)], wait, **options)
+
+
+def open_local_engine(
+    run: Run,
+    units: list[Unit],
+    make_host: Callable[[], Host],
+    slots: int,
+    drawing: Mapping[str, str | None] | None,
+    **options: Any,
+) -> LocalEngine:
+    """Starts the simulators, has each make its first task and a picture while the policy loads, and puts both
+    together.
+
+    Args:
+        run: pool, protocol, trial log.
+        units: what will be run.
+        make_host: loads the policy.
+        slots: simulators at once, at most.
+        drawing: environment variables that say where simulators draw; None where they draw nothing.
+        options: of `Engine`.
+
+    Raises:
+        SimulatorError: no simulator can be made.
+    """
+    if drawing is not None:
+        run.pool.configure(environment=drawing)
+    count = min(slots, len(units))
+    begun = list(zip(run.pool.slots(count), first_units(unfinished(run, units), count), strict=False))
+    for slot, unit in begun:
+        slot.send(*(("fingerprint",) if drawing is None else ("smoke", unit.scenario)))
+    host = make_host()
+    # Where no simulator can be made the run is refused; where only some break, it is their trials' affair.
+    replies = [slot.receive() for slot, _ in begun]
+    check_smoke(replies[0])
+    return LocalEngine(run, host, slots=count, **options)

@@ -1,0 +1,338 @@
+"""`roborecover eval`: LeRobot's own configuration and loaders, an engine, and a table at the end."""
+
+import json
+import logging
+import re
+import signal
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.configs import parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_roborecover.analysis.summary import format_table, summarise
+from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.env.facts import facts_of
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.render_device import egl_devices, render_environment
+from lerobot_roborecover.env.run import Run, group_name, open_run
+from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.trials.engine import Engine, units_of
+from lerobot_roborecover.trials.load import HostSpec, load_host
+from lerobot_roborecover.trials.local import open_local_engine
+from lerobot_roborecover.trials.progress import ProgressLine, Tally
+from lerobot_roborecover.trials.sequential import ALONE, open_watch
+from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
+from lerobot_roborecover.trials.units import OrderedQueue, Unit, UnitQueue
+from lerobot_roborecover.trials.videos import VideoKeeper
+
+logger = logging.getLogger(__name__)
+
+ENGINES = ("local", "ray")
+ALIASES = {
+    "engine": "runner.engine",
+    "videos": "runner.videos",
+    "limit-seconds": "runner.limit_seconds",
+    "sequential": "runner.sequential",
+    "shard": "env.shard",
+}
+"""Short names of options that this command has and `lerobot-eval` does not."""
+
+
+@dataclass
+class RunnerOptions:
+    """Options of `--runner.*`."""
+
+    engine: str = "local"
+    """`local`: this machine; `ray`: a Ray cluster."""
+    slots: int = 0
+    """Simulators at once; 0 takes one per core, and two per core under a policy on a GPU as far as memory
+    allows."""
+    max_batch: int = 64
+    """Slots the policy is asked for at once, at most."""
+    batch_delay_ms: float = 10.0
+    """How long a slot waits for company before the policy is asked for it."""
+    limit_seconds: float = 0.0
+    """Stop cleanly after this long; 0 does not. The same command goes on where it stopped."""
+    videos: int = 0
+    """MP4s to keep under `videos/` in the output directory, at most."""
+    videos_of: str = "failures"
+    """Of which trials: `failures`, `successes`, `all`, or comma-separated scenario ids."""
+    render_device: str = "auto"
+    """Where simulators draw: `auto` (the policy's GPU; on a Ray cluster the GPUs of a simulator's own
+    machine, in turn), `cpu`, or a GPU's number."""
+    ray_address: str = "auto"
+    """A Ray cluster's address; `auto` finds the one this machine belongs to."""
+    replicas: int = 0
+    """Copies of the policy on a Ray cluster; 0 takes one per GPU, or a single one for a policy on the CPU."""
+    sequential: str = ""
+    """A trial log to compare with while the run goes: it stops as soon as the comparison is decided. `alone`
+    compares with nobody, and shows an interval that holds whenever it is looked at."""
+    portable: bool = False
+    """Compute a diffusion policy's noise schedule in float64, so that its roots round alike on every
+    processor; the last bit of its actions then differs from `lerobot-eval`'s."""
+
+    def check(self) -> None:
+        """Refuses what cannot be used.
+
+        Raises:
+            OptionError: naming the option, its value and what it may be.
+        """
+        if self.engine not in ENGINES:
+            raise OptionError(f"--runner.engine={self.engine}: not one of {list(ENGINES)}")
+        for name, low, high in (
+            ("slots", 0, 4096),
+            ("max_batch", 1, 4096),
+            ("batch_delay_ms", 0, 10_000),
+            ("limit_seconds", 0, 10**8),
+            ("videos", 0, 100_000),
+            ("replicas", 0, 4096),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise OptionError(f"--runner.{name}={getattr(self, name)}: must be from {low} to {high}")
+
+
+@dataclass
+class RecoveryEvalConfig(EvalPipelineConfig):
+    """LeRobot's evaluation config, plus the runner's options. `eval.batch_size` is not used."""
+
+    runner: RunnerOptions = field(default_factory=RunnerOptions)
+
+
+class Stopper:
+    """Says when to stop: after a time limit, or at the first Ctrl-C (the second one kills).
+
+    Args:
+        limit_s: seconds from now; 0 for none.
+    """
+
+    def __init__(self, limit_s: float):
+        self._deadline = time.monotonic() + limit_s if limit_s else float("inf")
+        self.reason = ""
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+
+    def _interrupt(self, *_: Any) -> None:
+        self.reason = "interrupted"
+        signal.signal(signal.SIGINT, self._before)
+
+    def __call__(self) -> bool:
+        """Whether to stop; `reason` then says why."""
+        if not self.reason and time.monotonic() >= self._deadline:
+            self.reason = "time limit reached"
+        return bool(self.reason)
+
+    def restore(self) -> None:
+        """Puts the caller's own signal handler back."""
+        signal.signal(signal.SIGINT, self._before)
+
+
+@parser.wrap()
+def evaluate(cfg: RecoveryEvalConfig) -> int:
+    """Runs the evaluation that a command line asks for; see `main`."""
+    cfg.runner.check()
+    if not hasattr(cfg.env, "run_spec"):
+        raise OptionError(f"--env.type={cfg.env.type}: not a recovery env type; use roborecover_libero, say")
+    if cfg.policy is None:
+        raise OptionError("no policy: give a checkpoint with --policy.path=FOLDER_OR_HUB_ID")
+    if cfg.eval.recording:
+        raise OptionError(
+            "--eval.recording=true: roborecover eval records no dataset. Use lerobot-eval for that, or "
+            "--videos=N for films"
+        )
+    out = Path(cfg.output_dir)
+    facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes, output_dir=out)
+    scenarios, run = open_run(cfg.env, cfg.env.run_spec(), workers=True, facts=facts)
+    run.protocol = replace(run.protocol, run_seed=cfg.seed)
+    run.pool.acquire()
+    stopper = Stopper(cfg.runner.limit_seconds)
+    try:
+        watch = open_watch(
+            cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
+            log=run.log.path, shard=cfg.env.shard,
+        )  # fmt: skip
+        order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
+        units = units_of(order, cfg.eval.n_episodes)
+        tally = watch or Tally(run.protocol.start, [s.id for s in scenarios], cfg.eval.n_episodes)
+        tally.add([asdict(r) for r in run.rows()])
+        line = ProgressLine(run.protocol.start, detailed=True)
+        line.show(tally)
+
+        def settled() -> bool:
+            if watch is not None and watch.decided and not stopper.reason:
+                stopper.reason = watch.words
+            return watch is not None and watch.decided
+
+        def show(row: TrialRow) -> None:
+            tally.add([asdict(row)])
+            line.show(tally)
+            settled()
+
+        videos = None
+        if cfg.runner.videos:
+            ids = [s.id for s in scenarios]
+            videos = VideoKeeper(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
+        if watch is not None:
+            watch.record(run.log.path)
+        if tally.done < tally.total and not settled():
+            options = {
+                "batch_delay_s": cfg.runner.batch_delay_ms / 1e3, "on_row": show, "videos": videos,
+                "queue_of": UnitQueue if watch is None else OrderedQueue,
+            }  # fmt: skip
+            make = _ray_engine if cfg.runner.engine == "ray" else _local_engine
+            make(cfg, run, units, options).run(units, stopper)
+        line.show(tally, final=True)
+        if watch is not None:
+            record = watch.record(run.log.path)
+        report(cfg, run, scenarios, [] if videos is None else videos.kept)
+        if watch is not None and record is not None:
+            print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
+            if watch.decided:
+                return 0
+        if stopper.reason:
+            print(
+                f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, run the same "
+                f"command with --env.trial_log={run.log.path} --output_dir={out}",
+                file=sys.stderr,
+            )
+            return 130 if stopper.reason == "interrupted" else 0
+        return 0
+    finally:
+        stopper.restore()
+        run.pool.release()
+
+
+def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
+    """The run's policy."""
+    runner = cfg.runner
+    return HostSpec(cfg.policy, cfg.env, cfg.rename_map, cfg.seed, runner.max_batch, runner.portable)
+
+
+def _local_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
+    drawing = None
+    if cfg.env.obs_type != "state" or cfg.runner.videos:
+        drawing = render_environment(cfg.runner.render_device, str(cfg.policy.device), egl_devices())
+    slots = cfg.runner.slots or default_slots(str(cfg.policy.device), usable_cores(), available_gb())
+    return open_local_engine(run, units, lambda: load_host(host_spec(cfg)), slots, drawing, **options)
+
+
+def _ray_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
+    from lerobot_roborecover.trials.ray_engine import open_ray_engine
+
+    renders = cfg.env.obs_type != "state" or cfg.runner.videos
+    cluster = {
+        "address": cfg.runner.ray_address,
+        "slots": cfg.runner.slots,
+        "replicas": cfg.runner.replicas,
+        "gpus": 1.0 if str(cfg.policy.device).startswith("cuda") else 0.0,
+        "snapshot_dir": cfg.env.snapshot_dir or None,
+        "smoke": UnitQueue(units).take(None).scenario if renders else None,
+        "render_device": cfg.runner.render_device,
+    }
+    return open_ray_engine(run, partial(load_host, host_spec(cfg)), **cluster, **options)
+
+
+def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Sequence[Path]) -> None:
+    """Writes `eval_info.json` and prints the table.
+
+    Args:
+        cfg: the run's configuration.
+        run: its log.
+        scenarios: what was asked for.
+        films: videos that were kept.
+    """
+    wanted = {s.id for s in scenarios}
+    rows = [r for r in run.rows() if r.scenario_id in wanted and r.trial < cfg.eval.n_episodes]
+    names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in films]
+    videos = {(m[1], int(m[2])): str(p) for m, p in names if m}
+    out = Path(cfg.output_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    info = eval_info(rows, cfg.env.group_by, videos)
+    (out / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
+    print(format_table(summarise([asdict(r) for r in rows])))
+    print(f"\ntrial log {run.log.path}\neval info {out / 'eval_info.json'}")
+    if films:
+        print(f"videos {films[0].parent} ({len(films)})")
+
+
+def eval_info(
+    rows: Sequence[TrialRow], group_by: str, videos: Mapping[tuple[str, int], str] | None = None
+) -> dict:
+    """The trials in the layout of `lerobot-eval`'s `eval_info.json`.
+
+    Args:
+        rows: of one protocol.
+        group_by: `suite`, `cell` or `source`.
+        videos: films by scenario and trial.
+    """
+    films = videos or {}
+    tasks: dict[tuple[str, str], list[TrialRow]] = defaultdict(list)
+    for row in rows:
+        tasks[group_name(row, group_by), row.scenario_id].append(row)
+    per_task, groups = [], defaultdict(list)
+    for (group, scenario_id), trials in sorted(tasks.items()):
+        successes = [t.success for t in sorted(trials, key=lambda t: t.trial)]
+        rewards = [float(s) for s in successes]
+        paths = [films[scenario_id, t.trial] for t in trials if (scenario_id, t.trial) in films]
+        metrics = {
+            "sum_rewards": rewards,
+            "max_rewards": rewards,
+            "successes": successes,
+            "video_paths": paths,
+        }
+        per_task.append({"task_group": group, "task_id": scenario_id, "metrics": metrics})
+        groups[group] += rewards
+
+    def aggregate(rewards: list[float]) -> dict:
+        mean = float(np.mean(rewards)) if rewards else None
+        percent = None if mean is None else 100 * mean
+        return {
+            "avg_sum_reward": mean, "avg_max_reward": mean, "pc_success": percent, "n_episodes": len(rewards),
+            "video_paths": [],
+        }  # fmt: skip
+
+    return {
+        "per_task": per_task,
+        "per_group": {group: aggregate(rewards) for group, rewards in groups.items()},
+        "overall": aggregate([r for rewards in groups.values() for r in rewards]),
+    }
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs with a command line in `lerobot-eval`'s words.
+
+    Args:
+        argv: arguments without the program's and the command's name.
+    """
+    from lerobot_roborecover.plugin import rewrite_env_argument
+
+    init_logging()
+    register_third_party_plugins()
+    # LeRobot's parser reads the process's own argument list, in several places.
+    sys.argv[:] = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
+    return evaluate()
+
+
+def _long_names(argv: Sequence[str]) -> list[str]:
+    """All arguments under their long names; `--sequential` without a log is given its value."""
+    found = [_long_name(argument) for argument in argv]
+    for k, name in enumerate(found):
+        if name == "--runner.sequential" and (k + 1 == len(found) or found[k + 1].startswith("--")):
+            found[k] = f"{name}={ALONE}"
+    return found
+
+
+def _long_name(argument: str) -> str:
+    """`--videos=3` as `--runner.videos=3`, and the like."""
+    name, _, value = argument.removeprefix("--").partition("=")
+    if not argument.startswith("--") or name not in ALIASES:
+        return argument
+    return f"--{ALIASES[name]}={value}" if value else f"--{ALIASES[name]}"

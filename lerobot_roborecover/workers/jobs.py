@@ -1,0 +1,232 @@
+"""Functions run in worker processes, each with one simulator: replays, pictures, checks, conversions.
+
+Making a simulator compiles its task (6 s of CPU on LIBERO), and what writes episodes imports LeRobot (11 to
+22 s), so a process and its simulator are kept from job to job, and from one use of the pool to the next;
+except where each job wants a process of its own (`fresh`), so that one which crashes or hangs is only its own
+end.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pickle
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from types import TracebackType
+from typing import Any
+
+from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.platforms import SimulatorError, make_simulator
+from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.workers.dispatch import each, in_order
+from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
+from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
+
+SERVER = f"{__name__}:JobServer"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A function to run."""
+
+    work: str
+    """`module:function`."""
+    arguments: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Done:
+    """Reply to a job: what the function returned."""
+
+    value: Any
+
+
+@dataclass(frozen=True)
+class Raised:
+    """Reply to a job: what the function raised."""
+
+    error: Exception
+    """As it was, where it can travel; else a `RuntimeError` of its words."""
+
+    @property
+    def words(self) -> str:
+        """For people: a refusal says itself what it is about, anything else begins with its type."""
+        plain = isinstance(self.error, RoboRecoverError)
+        return str(self.error) if plain else f"{type(self.error).__name__}: {self.error}"
+
+
+type Outcome = Done | Raised | SlotFailure
+
+
+class JobServer:
+    """Runs jobs in a worker process.
+
+    Args:
+        config: platform and options of the simulator, which is made when a job first asks for it.
+    """
+
+    def __init__(self, config: SlotConfig):
+        global _server
+        self._config = config
+        self._simulator: Simulator | None = None
+        _server = self
+
+    @property
+    def simulator(self) -> Simulator:
+        """Made when first asked for."""
+        if self._simulator is None:
+            self._simulator = make_simulator(self._config.platform, **self._config.options)
+        return self._simulator
+
+    def answer(self, command: str, argument: Job) -> Done | Raised:
+        """Runs a job; the only command is `run`."""
+        assert command == "run", command
+        try:
+            module, _, name = argument.work.partition(":")
+            work = getattr(importlib.import_module(module), name)
+            return Done(work(*argument.arguments))
+        except Exception as err:
+            traceback.print_exc()
+            return Raised(_portable(err))
+
+    def close(self) -> None:
+        """Closes the simulator."""
+        if self._simulator is not None:
+            self._simulator.close()
+
+
+_server: JobServer | None = None
+
+
+def simulator_of_worker() -> Simulator:
+    """The simulator of this worker process, made when first asked for."""
+    assert _server is not None, "not in a worker process"
+    return _server.simulator
+
+
+def _portable(error: Exception) -> Exception:
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:  # simulators and drivers raise types of their own, which may not even pickle
+        return RuntimeError(f"{type(error).__name__}: {error}")
+
+
+class JobPool:
+    """Worker processes for jobs; started as jobs come, at most as many as said.
+
+    Args:
+        platform: of the simulators; empty where no job asks for one.
+        options: of the simulators, JSON values.
+        workers: processes.
+        limit_s: longest that one job may take; None waits for ever.
+        fresh: each job has a process of its own; its start counts.
+    """
+
+    def __init__(
+        self,
+        platform: str = "",
+        options: Mapping[str, Any] | None = None,
+        workers: int = 1,
+        *,
+        limit_s: float | None = None,
+        fresh: bool = False,
+    ):
+        self.platform, self.options = platform, dict(options or {})
+        self._workers, self._fresh = max(1, workers), fresh
+        self._pool = SlotPool(
+            SlotConfig(platform, self.options, server=SERVER, start_s=0.0 if fresh else None),
+            workers=True,
+            timeout_s=math.inf if limit_s is None else limit_s,
+        )
+
+    def __enter__(self) -> JobPool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.close()
+
+    def outcomes[I](
+        self, work: Callable[..., Any], items: Iterable[I], arguments: Callable[[I], tuple]
+    ) -> Iterator[tuple[I, Outcome]]:
+        """Runs `work(*arguments(item))` for every item, and yields what became of each as it comes.
+
+        Args:
+            work: a function of a module.
+            items: drawn as there is room, so that they never have to fit into memory.
+            arguments: of one item, picklable.
+        """
+        name = _name_of(work)
+        drawn = iter(items)
+        first = list(islice(drawn, self._workers))
+        waiting = chain(first, drawn)
+
+        def take(_last: list[I] | None, _busy: list[list[I]]) -> list[I] | None:
+            return next(([item] for item in waiting), None)
+
+        for (item,), reply in each(
+            self._slots(len(first)), "run", take, lambda one: Job(name, arguments(one[0])), fresh=self._fresh
+        ):
+            yield item, reply
+
+    def run[I](
+        self,
+        work: Callable[..., Any],
+        items: Iterable[I],
+        arguments: Callable[[I], tuple] = lambda item: (item,),
+    ) -> Iterator[tuple[I, Any]]:
+        """The items with their results, as they come.
+
+        Raises:
+            SimulatorError: a process died or hung.
+            Exception: what a job raised.
+        """
+        for item, outcome in self.outcomes(work, items, arguments):
+            yield item, _value(outcome)
+
+    def in_order[I](
+        self,
+        work: Callable[..., Any],
+        items: Sequence[I],
+        arguments: Callable[[I], tuple] = lambda item: (item,),
+    ) -> Iterator[Any]:
+        """The results in the order of the items, with few of them ahead of the caller: see `run`."""
+        name, slots = _name_of(work), self._slots(min(self._workers, len(items)))
+        for outcome in in_order(slots, "run", items, lambda item: Job(name, arguments(item))):
+            yield _value(outcome)
+
+    def call(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """Runs `work` in a process that has imported by now what jobs before it needed: see `run`."""
+        ((_, value),) = self.run(work, [arguments], lambda them: them)
+        return value
+
+    def _slots(self, count: int) -> list[WorkerSlot]:
+        return self._pool.worker_slots(count)
+
+
+def _value(outcome: Outcome) -> Any:
+    if isinstance(outcome, Raised):
+        raise outcome.error
+    if isinstance(outcome, SlotFailure):
+        raise SimulatorError(
+            "a worker process died (out of memory, or a crash in native code) or hung. What it had finished "
+            "is kept: run the command again, with fewer workers if memory was short. It said: "
+            f"{outcome.message}"
+        )
+    return outcome.value
+
+
+def _name_of(work: Callable[..., Any]) -> str:
+    """`module:function`, as a worker finds it: the program that was started is no `__main__` there."""
+    module, name = work.__module__, work.__qualname__
+    if module == "__main__":
+        spec = getattr(sys.modules["__main__"], "__spec__", None)
+        module = spec.name if spec is not None else module
+    if "." in name or module == "__main__":
+        raise ValueError(f"{module}:{name} is no function of a module that a worker can import")
+    return f"{module}:{name}"

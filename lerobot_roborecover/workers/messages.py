@@ -1,0 +1,152 @@
+"""What the parent asks of a slot and what comes back; plain data, so that it travels to a worker process.
+
+On the wire there are a `SlotConfig` first, then `Command`s, and one reply to each of these.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from lerobot_roborecover.replay import Handoff
+from lerobot_roborecover.scenario import TrialStart
+
+
+@dataclass(frozen=True)
+class SlotConfig:
+    """How a slot makes its simulator; one slot serves one platform."""
+
+    platform: str
+    options: dict[str, Any] = field(default_factory=dict)
+    """Keyword options of the simulator."""
+    snapshot_dir: str | None = None
+    """Folder of handoff snapshots shared by the slots of a run; None keeps them in each slot's memory."""
+    approximate_snapshots: bool = False
+    """Use snapshots also where what follows them drifts from a replay."""
+    control_mode: str | None = None
+    """How actions after the handoff are read, for simulators that have more than one way."""
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+    """Environment variables of a worker process, beside the caller's; None unsets one."""
+    server: str = "lerobot_roborecover.env.slot_server:SlotServer"
+    """`module:class` that answers the slot's commands, made with this configuration."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What a server other than the usual one wants to know; plain JSON values."""
+    start_s: float | None = None
+    """What a fresh worker may take to import its simulator, beside the watchdog's limit for its first
+    command; None for the usual."""
+
+    def make_server(self) -> Server:
+        """The server, in this process."""
+        module, _, name = self.server.partition(":")
+        return getattr(importlib.import_module(module), name)(self)
+
+
+class Server(Protocol):
+    """What lives in a worker and answers its commands."""
+
+    def answer(self, command: str, argument: Any = None) -> Any:
+        """Runs one command; its reply."""
+
+    def close(self) -> None:
+        """Ends the simulator."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """One thing to do; the slot replies once, with a `SlotFailure` where it cannot."""
+
+    name: str
+    argument: Any = None
+
+
+@dataclass(frozen=True)
+class More:
+    """Reply in place of a result: it is under way; the same command without an argument goes on with it."""
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """One trial's start."""
+
+    scenario: TrialStart
+    start: str
+    rewind_steps: int
+    handoff_check: bool
+    filmed: bool = False
+    """Whether replies to `reset` and `act` bring a frame of every step, for a video."""
+    rollback_steps: int = 0
+    """How far back a rollback may be asked for: snapshots of as many steps are kept, where they are exact."""
+
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """Reply to a reset."""
+
+    observation: dict[str, Any]
+    handoff: Handoff
+    frame: np.ndarray | None = None
+    """(H, W, 3) uint8, upright; where the trial is filmed."""
+    hz: float = 0.0
+    """Control steps per simulated second."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Reply to a step."""
+
+    observation: dict[str, Any]
+    success: bool
+    seconds: float
+    """Wall time of the simulator, observation included."""
+
+
+@dataclass(frozen=True)
+class ActResult:
+    """Reply to `act`: several actions executed without looking in between."""
+
+    observation: dict[str, Any] | None
+    """After the last action; None once the trial is over, because nobody looks at it."""
+    steps: int
+    """Actions executed: all, or those up to success or the horizon."""
+    success: bool
+    over: bool
+    """The trial has succeeded or run out of steps."""
+    seconds: float
+    """Wall time of the simulator, observation included."""
+    frames: tuple[np.ndarray, ...] = ()
+    """(H, W, 3) uint8 after each step, where the trial is filmed."""
+
+
+@dataclass(frozen=True)
+class RollbackResult:
+    """Reply to `rollback`: the simulation is some steps back."""
+
+    observation: dict[str, Any]
+    distance: int
+    """Steps gone back; fewer than asked for where there are not as many."""
+    undone: int
+    """Those of them that the policy had taken; the others are of the prefix."""
+    method: str
+    """`snapshot`, or `replay` from the reset."""
+    seconds: float
+    """Wall time, observation included."""
+    solved: bool
+    """Whether the task's predicate holds there already, which leaves nothing to recover from."""
+    frame: np.ndarray | None = None
+    """(H, W, 3) uint8, where the trial is filmed."""
+
+
+@dataclass(frozen=True)
+class SlotFailure:
+    """Reply in place of a result: the simulator raised, its process died, or it did not answer in time."""
+
+    kind: str
+    """`raised`, `died`, `hung`, or `lost` where the slot is gone together with its machine."""
+    message: str
+
+
+type Reply = EpisodeStart | StepResult | ActResult | RollbackResult | SlotFailure | np.ndarray | dict | None

@@ -1,0 +1,1 @@
+"""How the shipped sets, policies and studies were made: run from a clone, not installed."""

@@ -1,0 +1,212 @@
+"""Expert demonstrations of Meta-World tasks as a LeRobotDataset without images, for `lerobot-train`.
+
+Half of the episodes are clean. In the other half the arm is shaken at the start, while the recorded action
+stays what the expert would have done, so that a policy trained on them has seen states beside the expert's
+path.
+
+    python -m recipes.metaworld.dataset --out DIR --episodes-per-task 70
+    python -m recipes.metaworld.dataset --out DIR --tasks study
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.metaworld import PLATFORM
+from lerobot_roborecover.platforms.metaworld.experts import expert
+from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
+from lerobot_roborecover.scenario import Reset, Task
+
+DEMO_TASKS = (
+    "assembly-v3",
+    "basketball-v3",
+    "box-close-v3",
+    "coffee-pull-v3",
+    "coffee-push-v3",
+    "hammer-v3",
+    "pick-place-v3",
+    "push-v3",
+    "shelf-place-v3",
+    "sweep-into-v3",
+)
+"""Tasks of the shipped policy. Nothing names the task to a policy that reads the state alone, so these are
+tasks whose 39 numbers tell them apart by themselves (object, its orientation, goal)."""
+
+STUDY_TASKS = (
+    *DEMO_TASKS,
+    "bin-picking-v3",
+    "disassemble-v3",
+    "hand-insert-v3",
+    "peg-insert-side-v3",
+    "soccer-v3",
+    "stick-push-v3",
+)
+"""Tasks of the study's policies: one object to handle, told apart by the state, solved by the scripted
+policies in at least five of six resets."""
+
+FIRST_SEED = 10_000
+"""Seeds of demonstrations start here; scenarios use smaller ones."""
+_STEPS_AFTER_SUCCESS = 5
+_MAX_STEPS = 300
+
+
+class Episode(NamedTuple):
+    """A recorded rollout of T steps."""
+
+    observations: np.ndarray
+    """(T, 39) float64, before each action."""
+    actions: np.ndarray
+    """(T, 4) float64: the driver's, not what the arm was shaken with."""
+    solved: np.ndarray
+    """(T,) bool, after each action."""
+
+
+def demonstration(simulator: MetaworldSimulator, task: Task, seed: int, shaken_steps: int) -> Episode | None:
+    """One successful expert episode.
+
+    Args:
+        simulator: with any `obs_type`.
+        task: what to demonstrate.
+        seed: of the reset and of the shaking.
+        shaken_steps: leading steps with the paper's perturbation on top of the executed action.
+
+    Returns:
+        The episode, or None where it did not succeed.
+    """
+    rng = np.random.default_rng(seed)
+    simulator.reset(task, Reset(seed=seed))
+    act = expert(simulator, task.name)
+
+    def shaken(t: int, action: np.ndarray) -> np.ndarray:
+        return perturb_translations(action, rng) if t < shaken_steps else action
+
+    return record(simulator, act, _MAX_STEPS, shaken)
+
+
+def record(
+    simulator: MetaworldSimulator,
+    act: Driver,
+    max_steps: int,
+    executed: Callable[[int, np.ndarray], np.ndarray] = lambda _t, action: action,
+) -> Episode | None:
+    """Drives to `_STEPS_AFTER_SUCCESS` solved steps.
+
+    Args:
+        simulator: reset.
+        act: the driver, whose actions are recorded.
+        max_steps: give up after these.
+        executed: what becomes of the driver's action at a step.
+
+    Returns:
+        The episode, or None where it did not succeed.
+    """
+    observations, actions, solved = [], [], []
+    for t in range(max_steps):
+        observations.append(simulator.low_dim())
+        actions.append(act(t))
+        simulator.step(executed(t, actions[-1]))
+        solved.append(simulator.succeeded())
+        if sum(solved) == _STEPS_AFTER_SUCCESS:
+            return Episode(np.array(observations), np.array(actions), np.array(solved))
+    return None
+
+
+def create_dataset(root: Path) -> Any:
+    """An empty LeRobotDataset at `root`, which must not exist.
+
+    Its features are those of `--env.obs_type=state`, float32: `observation.state` (4),
+    `observation.environment_state` (39), `action` (4); and `next.reward` (1 once the task is solved), which
+    TD-MPC learns from.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    def vector(size: int) -> dict[str, object]:
+        return {"dtype": "float32", "shape": (size,), "names": None}
+
+    return LeRobotDataset.create(
+        repo_id="roborecover/metaworld_demonstrations",
+        root=root,
+        fps=80,
+        robot_type="sawyer",
+        features={
+            "observation.state": vector(4),
+            "observation.environment_state": vector(39),
+            "action": vector(4),
+            "next.reward": vector(1),
+        },
+        use_videos=False,
+    )
+
+
+def save_episode(dataset: Any, task: Task, episode: Episode) -> None:
+    """Appends an episode."""
+    for raw, action, solved in zip(*(part.astype(np.float32) for part in episode), strict=True):
+        frame = {"observation.state": raw[:4], "observation.environment_state": raw, "action": action}
+        dataset.add_frame({**frame, "next.reward": solved[None], "task": task.instruction})
+    dataset.save_episode()
+
+
+def save_demonstrations(
+    dataset: Any, simulator: MetaworldSimulator, name: str, count: int, shaken_steps: Callable[[int], int]
+) -> int:
+    """Appends successful demonstrations of a task.
+
+    Args:
+        dataset: of `create_dataset`.
+        simulator: any.
+        name: of the task.
+        count: how many.
+        shaken_steps: leading steps with perturbed actions, by how many demonstrations there are.
+
+    Returns:
+        Rollouts that it took.
+    """
+    task, found, seed = PLATFORM.task(name), 0, FIRST_SEED
+    while found < count:
+        episode = demonstration(simulator, task, seed, shaken_steps(found))
+        seed += 1
+        if episode is not None:
+            save_episode(dataset, task, episode)
+            found += 1
+    return seed - FIRST_SEED
+
+
+def write_demonstrations(root: Path, task_names: Iterable[str], episodes_per_task: int) -> None:
+    """Writes the dataset; `root` must not exist."""
+    dataset = create_dataset(root)
+    simulator = MetaworldSimulator(obs_type="state")
+    for name in task_names:
+        rollouts = save_demonstrations(
+            dataset, simulator, name, episodes_per_task, lambda k: 0 if k % 2 == 0 else 20 + 20 * (k % 7)
+        )
+        print(f"{name}: {episodes_per_task} episodes from {rollouts} rollouts", flush=True)
+    dataset.finalize()
+    simulator.close()
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder to write; must not exist")
+    parser.add_argument("--episodes-per-task", type=int, default=70)
+    parser.add_argument("--tasks", nargs="+", default=list(DEMO_TASKS), help="names, or `study`")
+    parser.add_argument("--overwrite", action="store_true", help="delete --out first")
+    args = parser.parse_args()
+    if args.overwrite and args.out.exists():
+        shutil.rmtree(args.out)
+    tasks = STUDY_TASKS if args.tasks == ["study"] else args.tasks
+    write_demonstrations(args.out, tasks, args.episodes_per_task)
+
+
+if __name__ == "__main__":
+    main()

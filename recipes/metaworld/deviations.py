@@ -1,0 +1,265 @@
+"""Deliberate deviations on Meta-World, one a cell: what a person at the controls would do to get there.
+
+Each drives a task by its numbers (hand, gripper, object, goal) to a state that belongs to one cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
+from lerobot_roborecover.scenario import DeviationType, Stage
+
+OPEN, CLOSED = -1.0, 1.0
+_GAIN = 10.0
+_ARRIVED_M = 0.015
+_ABOVE_M = 0.18
+"""How high above the table the hand travels."""
+
+
+class Fumbled(Exception):
+    """The deviation did not come about; another seed may do."""
+
+
+class Controls(Protocol):
+    """What drives: `low_dim()` as a simulator has it, and one action at a time."""
+
+    def low_dim(self) -> np.ndarray:
+        """(39,) Meta-World's numbers now."""
+
+    def point(self, name: str) -> np.ndarray:
+        """(3,) position of a body or mark, metres."""
+
+    def names(self) -> list[str]:
+        """Bodies and marks."""
+
+    def act(self, action: np.ndarray) -> bool:
+        """Executes (4,); returns whether the task is solved."""
+
+
+@dataclass
+class Hand:
+    """Small motions out of which deviations are made."""
+
+    controls: Controls
+    expert: Driver
+    """The task's scripted policy, for everything up to the deviation."""
+    rng: np.random.Generator
+    start: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        self.start = self.object()
+
+    def at(self) -> np.ndarray:
+        """(3,) between the fingertips."""
+        return self.controls.point("eef")
+
+    def object(self) -> np.ndarray:
+        """(3,) the handled point."""
+        return self.controls.point(self._handled() + HANDLE)
+
+    def goal(self) -> np.ndarray:
+        """(3,) where it belongs."""
+        return self.controls.point(GOAL)
+
+    def other(self) -> np.ndarray:
+        """(3,) the first part that is not to be handled.
+
+        Raises:
+            Fumbled: there is none.
+        """
+        rest = [
+            n for n in self.controls.names() if n not in ("eef", GOAL, self._handled()) and HANDLE not in n
+        ]
+        if not rest:
+            raise Fumbled("the task has one object alone")
+        return self.controls.point(rest[0])
+
+    def _handled(self) -> str:
+        return next(n for n in self.controls.names() if n.endswith(HANDLE)).removesuffix(HANDLE)
+
+    def act(self, velocity: np.ndarray, grip: float) -> None:
+        """One action, clipped.
+
+        Raises:
+            Fumbled: it solved the task.
+        """
+        if self.controls.act(np.clip(np.array([*velocity, grip]), -1.0, 1.0)):
+            raise Fumbled("the task was solved on the way")
+
+    def go(self, target: np.ndarray, grip: float, most: int = 60) -> None:
+        """Towards a point, until there or no longer getting on."""
+        for _ in range(most):
+            error = np.asarray(target) - self.at()
+            if np.linalg.norm(error) < _ARRIVED_M:
+                return
+            self.act(_GAIN * error, grip)
+
+    def hold(self, steps: int, grip: float) -> None:
+        """Stays where it is."""
+        for _ in range(steps):
+            self.act(np.zeros(3), grip)
+
+    def carry(self, when: Callable[[], bool], most: int = 150) -> None:
+        """The scripted policy, until a condition holds.
+
+        Raises:
+            Fumbled: it never did.
+        """
+        for t in range(most):
+            if when():
+                return
+            if self.controls.act(self.expert(t)):
+                raise Fumbled("the task was solved on the way")
+        raise Fumbled("the scripted policy did not get that far")
+
+    def grasp(self, far_m: float = 0.03) -> None:
+        """The scripted policy, until the object has gone along with the hand for so far."""
+
+        def carried() -> bool:
+            moved = np.linalg.norm(self.object() - self.start) > far_m
+            return bool(moved and np.linalg.norm(self.object() - self.at()) < 0.06)
+
+        self.carry(carried)
+
+    def up(self, grip: float, height_m: float = _ABOVE_M) -> None:
+        """Rises above the table."""
+        self.go(np.array([*self.at()[:2], height_m]), grip)
+
+    def sideways(self, low_m: float, high_m: float) -> np.ndarray:
+        """(3,) a random horizontal offset, rather to the sides than forth and back."""
+        side = self.rng.choice([-1.0, 1.0])
+        distance, angle = self.rng.uniform(low_m, high_m), self.rng.uniform(-0.6, 0.6)
+        return distance * np.array([side * np.cos(angle), np.sin(angle), 0.0])
+
+
+def wrong_part(hand: Hand) -> None:
+    """Goes to a part that is not to be handled, and presses it."""
+    part = hand.other()
+    hand.up(CLOSED, max(_ABOVE_M, part[2] + 0.1))
+    hand.go(part + np.array([0.0, -0.06, 0.08]), CLOSED)
+    hand.go(part + np.array([0.0, -0.02, 0.0]), CLOSED, 30)
+    for _ in range(30):
+        if np.linalg.norm(hand.other() - part) > 0.02:
+            break
+        hand.act(np.array([0.0, 0.7, -0.2]), CLOSED)
+
+
+def beside(hand: Hand) -> None:
+    """Comes down beside the object, too far away to touch it."""
+    spot = hand.object() + hand.sideways(0.14, 0.2)
+    hand.go(np.array([*spot[:2], _ABOVE_M]), OPEN)
+    hand.go(np.array([*spot[:2], max(hand.object()[2] + 0.03, 0.06)]), OPEN)
+
+
+def dropped(hand: Hand) -> None:
+    """Takes the object, lets it fall on the way, and goes on without it."""
+    hand.grasp()
+    hand.go(hand.at() + hand.sideways(0.05, 0.1) + np.array([0.0, 0.0, 0.05]), CLOSED, 25)
+    hand.hold(12, OPEN)
+    hand.up(OPEN, 0.22)
+    hand.go(hand.at() + hand.sideways(0.06, 0.1), OPEN, 30)
+
+
+def knocked(hand: Hand) -> None:
+    """Sweeps the object aside with a closed gripper, and rises."""
+    thing, aside = hand.object(), hand.sideways(0.1, 0.12)
+    height = max(thing[2], 0.03)
+    hand.go(np.array([*(thing - aside)[:2], _ABOVE_M]), CLOSED)
+    hand.go(np.array([*(thing - aside)[:2], height]), CLOSED)
+    hand.go(np.array([*(thing + 0.5 * aside)[:2], height]), CLOSED, 30)
+    hand.up(OPEN, 0.22)
+
+
+def too_high(hand: Hand) -> None:
+    """Closes the gripper just above the object, beside its middle."""
+    spot = hand.object() + hand.sideways(0.015, 0.03)
+    hand.go(np.array([*spot[:2], _ABOVE_M]), OPEN)
+    hand.go(np.array([*spot[:2], hand.object()[2] + 0.055]), OPEN)
+    hand.hold(12, CLOSED)
+
+
+def astray(hand: Hand) -> None:
+    """Carries the object off its way, and stops with it in the grasp."""
+    hand.grasp()
+    hand.go(hand.at() + hand.sideways(0.06, 0.1) + np.array([0.0, 0.0, 0.06]), CLOSED, 30)
+
+
+def wrong_place(hand: Hand) -> None:
+    """Puts the object down where it does not belong, and stays there."""
+    hand.grasp()
+    away = hand.start[:2] + hand.sideways(0.1, 0.14)[:2]
+    hand.go(np.array([*away, hand.at()[2]]), CLOSED, 40)
+    low = hand.at() - np.array([0.0, 0.0, max(hand.object()[2] - hand.start[2], 0.0)])
+    hand.go(low, CLOSED, 25)
+    hand.hold(8, CLOSED)
+    hand.hold(14, OPEN)
+
+
+def nearly(hand: Hand) -> None:
+    """Brings the object close to its place, and stops beside it."""
+
+    def near() -> bool:
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
+
+    hand.grasp()
+    hand.carry(near)
+    hand.go(hand.at() + hand.sideways(0.02, 0.03), CLOSED, 15)
+
+
+def fallen_beside(hand: Hand) -> None:
+    """Lets the object fall just before its place, and rises."""
+
+    def near() -> bool:
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
+
+    hand.grasp()
+    hand.carry(near)
+    hand.hold(12, OPEN)
+    hand.up(OPEN, hand.at()[2] + 0.1)
+
+
+def place_disturbed(hand: Hand) -> None:
+    """With the object in the grasp, pushes what it is to be brought to out of the way."""
+    hand.grasp()
+    target = hand.other()
+    offset = hand.object() - hand.at()
+    beside_it = target - offset + np.array([0.02, 0.14, 0.0])
+    hand.go(np.array([*beside_it[:2], hand.at()[2] + 0.08]), CLOSED, 50)
+    hand.go(np.array([*beside_it[:2], target[2] - 0.05]), CLOSED, 30)
+    for _ in range(40):
+        if np.linalg.norm(hand.other() - target) > 0.05:
+            break
+        hand.act(np.array([0.0, -0.8, 0.0]), CLOSED)
+    hand.go(hand.at() + np.array([-0.04, 0.03, 0.0]), CLOSED, 12)
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """One way into a cell."""
+
+    stage: Stage
+    deviation: DeviationType
+    make: Callable[[Hand], None]
+    grip: float
+    """Gripper while stopped."""
+
+
+DEVIATIONS: dict[str, Deviation] = {
+    "wrong-part": Deviation(Stage.APPROACH, DeviationType.WRONG_TARGET, wrong_part, CLOSED),
+    "beside": Deviation(Stage.APPROACH, DeviationType.WRONG_POSE, beside, OPEN),
+    "dropped": Deviation(Stage.APPROACH, DeviationType.STAGE_ROLLBACK, dropped, OPEN),
+    "knocked": Deviation(Stage.APPROACH, DeviationType.SCENE_CHANGE, knocked, OPEN),
+    "too-high": Deviation(Stage.CONTACT, DeviationType.WRONG_POSE, too_high, CLOSED),
+    "astray": Deviation(Stage.MOVE, DeviationType.WRONG_POSE, astray, CLOSED),
+    "wrong-place": Deviation(Stage.PLACE, DeviationType.WRONG_TARGET, wrong_place, OPEN),
+    "nearly": Deviation(Stage.PLACE, DeviationType.WRONG_POSE, nearly, CLOSED),
+    "fallen-beside": Deviation(Stage.PLACE, DeviationType.SCENE_CHANGE, fallen_beside, OPEN),
+    "place-disturbed": Deviation(Stage.PLACE, DeviationType.SCENE_CHANGE, place_disturbed, CLOSED),
+}
+"""By name."""

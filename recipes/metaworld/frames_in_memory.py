@@ -1,0 +1,93 @@
+"""Training on a small dataset of numbers without waiting for it.
+
+LeRobot 0.6.1 reads every frame of a LeRobotDataset anew from Arrow, some 2 ms a frame and twice that with
+action chunks: half a second for a batch of 128, many times what a small policy takes to learn from it. A
+dataset without pictures fits into memory as a few tensors. `lerobot-train` sees the same frames in the same
+order either way (a test compares them), only sooner:
+
+    python -m recipes.metaworld.frames_in_memory --config_path=... (as lerobot-train)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+
+class FramesBatch(dict[str, Any]):
+    """A batch that is collated already."""
+
+
+class FramesInMemory:
+    """The numbers of a dataset reader, as tensors.
+
+    Args:
+        reader: LeRobot's `DatasetReader` of a dataset without pictures, loaded.
+    """
+
+    def __init__(self, reader: Any):
+        import torch
+
+        table = reader.hf_dataset.data.table
+        self._columns = {name: torch.tensor(table[name].to_pylist()) for name in table.column_names}
+        episodes = reader._meta.episodes
+        self._bounds = np.stack([episodes["dataset_from_index"], episodes["dataset_to_index"]], axis=1)
+        self._deltas = {key: np.array(steps) for key, steps in (reader.delta_indices or {}).items()}
+        self._tasks = list(reader._meta.tasks.index)
+        # Where an episode's frames begin among those that were loaded (all of them, or some episodes').
+        loaded = self._columns["index"].numpy()
+        self._row_of = np.full(int(loaded.max()) + 1, -1)
+        self._row_of[loaded] = np.arange(len(loaded))
+
+    def batch(self, rows: list[int]) -> FramesBatch:
+        """What PyTorch's collation makes of `DatasetReader.get_item` of each of the rows."""
+        import torch
+
+        batch = FramesBatch({name: column[rows] for name, column in self._columns.items()})
+        index, bounds = batch["index"].numpy(), self._bounds[batch["episode_index"].numpy()]
+        for key, steps in self._deltas.items():
+            wanted = index[:, None] + steps
+            first, end = bounds[:, :1], bounds[:, 1:]
+            batch[f"{key}_is_pad"] = torch.from_numpy((wanted < first) | (wanted >= end))
+            batch[key] = self._columns[key][self._row_of[np.clip(wanted, first, end - 1)]]
+        batch["task"] = [self._tasks[task] for task in batch["task_index"]]
+        return batch
+
+
+@contextmanager
+def frames_in_memory() -> Iterator[None]:
+    """While it lasts, data loaders get whole batches of LeRobot's datasets without pictures from memory."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from torch.utils.data._utils.collate import default_collate_fn_map
+
+    frames: WeakKeyDictionary[Any, FramesInMemory] = WeakKeyDictionary()
+
+    def getitems(dataset: Any, rows: list[int]) -> list[Any]:
+        if dataset.meta.camera_keys or dataset.meta.has_language_columns:
+            return [dataset[row] for row in rows]
+        if dataset not in frames:
+            frames[dataset] = FramesInMemory(dataset.reader)
+        return [frames[dataset].batch(rows)]
+
+    LeRobotDataset.__getitems__ = getitems
+    default_collate_fn_map[FramesBatch] = lambda batches, collate_fn_map: dict(batches[0])
+    try:
+        yield
+    finally:
+        del LeRobotDataset.__getitems__, default_collate_fn_map[FramesBatch]
+
+
+def main() -> None:
+    """`lerobot-train` with `frames_in_memory`."""
+    from lerobot.scripts.lerobot_train import main as lerobot_train
+
+    with frames_in_memory():
+        lerobot_train()
+
+
+if __name__ == "__main__":
+    main()

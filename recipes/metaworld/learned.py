@@ -1,0 +1,46 @@
+"""A learned policy that drives a Meta-World simulator directly, as the starter set's weak driver."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
+from lerobot_roborecover.scenario import Task
+
+
+class LearnedPolicy:
+    """A LeRobot checkpoint that reads the low-dimensional state, run as `lerobot-eval` would: a driver.
+
+    Args:
+        simulator: made with `obs_type="state"`.
+        task: whose instruction the policy gets.
+        checkpoint: folder or Hub id.
+    """
+
+    def __init__(self, simulator: MetaworldSimulator, task: Task, checkpoint: str):
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        config = PreTrainedConfig.from_pretrained(checkpoint)
+        config.device = "cpu"
+        self._policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+        overrides = {"device_processor": {"device": "cpu"}}
+        self._before, self._after = make_pre_post_processors(
+            config, checkpoint, preprocessor_overrides=overrides
+        )
+        self._simulator, self._task = simulator, task
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the episode."""
+        self._policy.reset()
+
+    def __call__(self, _t: int) -> np.ndarray:
+        """See `Driver`."""
+        import torch
+        from lerobot.envs.utils import preprocess_observation
+
+        batched = {key: value[None] for key, value in self._simulator.observe().items()}
+        with torch.inference_mode():
+            observation = self._before({**preprocess_observation(batched), "task": [self._task.instruction]})
+            return self._after(self._policy.select_action(observation))[0].numpy().astype(np.float64)

@@ -1,0 +1,329 @@
+"""Evidence that may be looked at at any time: the test's size and its interval, the order, the run that
+stops, and what a report makes of its log."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lerobot_roborecover.analysis.compare import compare, to_screen
+from lerobot_roborecover.analysis.leaderboard import make_leaderboard
+from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.sequential_record import read_record, record_path
+from lerobot_roborecover.analysis.verdicts import Verdict
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.env.facts import RunFacts
+from lerobot_roborecover.env.options import OptionError, RecoveryOptions
+from lerobot_roborecover.env.run import PlatformPart, open_run
+from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.trials.sequential import ALONE, open_watch
+from lerobot_roborecover.trials.units import OrderedQueue, Unit
+from lerobot_roborecover.workers.messages import SlotConfig
+from tests.support.factories import fake_dataset, fake_scenario
+from tests.support.trial_rows import policy_rows, write_log
+from tests.trials.test_local_engine import PushHost
+
+STEPS = st.lists(st.integers(-5, 5), min_size=1, max_size=40)
+
+
+def taken(steps, units=None, level=0.95):
+    test = SequentialTest(units or len(steps), 5, level)
+    for step in steps:
+        test.add(step / 5)
+    return test
+
+
+@pytest.mark.parametrize("sizes", [[1] * 11, [1, 2, 3, 1, 2, 5, 4, 3, 2, 1, 1]])
+@pytest.mark.parametrize("level", [0.95, 0.8])
+def test_the_error_over_all_looks_is_exactly_within_the_level(sizes, level):
+    """Every pattern of signs is as likely under "the two are alike": so many of them may decide, no more."""
+    decided = [
+        taken(np.array(signs) * sizes, level=level).decided_after is not None
+        for signs in product((-1, 1), repeat=len(sizes))
+    ]
+    assert 0.4 * (1 - level) < np.mean(decided) <= 1 - level
+
+
+@settings(max_examples=25)
+@given(STEPS, st.integers(0, 30))
+def test_decision_and_p_say_the_same(steps, more):
+    test = taken(steps, len(steps) + more)
+    d = test.difference
+    if test.decided_after is not None:
+        assert test.p <= 0.05 + 1e-6
+    elif more:
+        assert test.p == 1
+    else:
+        assert test.p > 0.05 - 1e-6
+    assert -1 <= d.low <= d.value <= d.high <= 1
+
+
+def test_p_is_one_on_every_level():
+    """Of all patterns of signs, no more than a share u has a p of at most u."""
+    sizes = [1, 2, 3, 1, 2, 5, 4, 3, 2, 1]
+    p = np.array([taken(np.array(signs) * sizes).p for signs in product((-1, 1), repeat=len(sizes))])
+    for u in (0.005, 0.02, 0.05, 0.2, 0.5):
+        assert np.mean(p <= u + 1e-12) <= u
+
+
+def test_what_comes_after_the_decision_counts_no_more():
+    test = taken([5] * 20, 40)
+    assert test.decided_after is not None
+    assert test.decided_after < 20
+    assert len(test.steps) == test.decided_after
+    assert taken([5] * 20 + [-5] * 20, 40).difference == test.difference
+
+
+def test_looking_every_time_with_a_fixed_test_would_be_wrong():
+    """What the sequential test is for: a fixed-n test at every look errs far more often than it says."""
+    from lerobot_roborecover.analysis.permutation import sign_flip_p
+
+    rng = np.random.default_rng(0)
+    walks = rng.integers(0, 2, (150, 40)) * 2 - 1
+    peeked = np.mean([any(sign_flip_p(w[:n]) < 0.05 for n in range(6, 41)) for w in walks])
+    assert peeked > 0.09
+    assert np.mean([taken(w).decided_after is not None for w in walks]) < 0.06
+
+
+def test_the_differences_interval_holds_where_few_scenarios_differ():
+    """Of rates of .02 and .1 the first scenarios mostly show no difference at all."""
+    rng, held = np.random.default_rng(0), []
+    for _ in range(40):
+        test = SequentialTest(40, 1)
+        for a, b in zip(rng.binomial(1, 0.1, 40), rng.binomial(1, 0.02, 40), strict=True):
+            test.add(float(a - b))
+        held.append(test.difference.low <= 0.08 <= test.difference.high)
+    assert np.mean(held) >= 0.9
+
+
+def test_a_rates_confidence_sequence_holds_at_every_time_at_once():
+    rng, held = np.random.default_rng(0), []
+    for _ in range(60):
+        found, kept = RateSequence(), True
+        for value in rng.binomial(1, 0.3, 40):
+            found.add(float(value))
+            kept &= found.estimate.low <= 0.3 <= found.estimate.high
+        held.append(kept)
+    assert np.mean(held) >= 0.93
+    for value, edge in ((0.0, "low"), (1.0, "high")):
+        all_alike = RateSequence()
+        for _ in range(50):
+            all_alike.add(value)
+        assert getattr(all_alike.estimate, edge) == value
+        assert all_alike.estimate.high - all_alike.estimate.low < 0.15
+
+
+def test_the_order_is_no_order_of_the_set_and_that_of_a_part_is_its_part():
+    names = [f"scenario:task-{n // 10}-{n % 10}" for n in range(60)]
+    order = sequence(names)
+    assert sorted(order) == names != order
+    assert sequence(reversed(names[:30])) == [n for n in order if n in names[:30]]
+    tasks = [n.split("-")[1] for n in order[:10]]
+    assert len(set(tasks)) > 3
+
+
+def test_trial_counts_decide_the_grid():
+    assert grid_of([5, 2]) == 10
+    assert grid_of([7, 9, 10]) == 120
+
+
+def test_units_come_in_the_order_given():
+    units = [Unit(fake_scenario(n), k) for n in (2, 0, 1) for k in range(2)]
+    queue = OrderedQueue(units)
+    assert [queue.take(units[-1]) for _ in range(2)] == units[:2]
+    queue.put_back(units[1])
+    assert len(queue) == 5
+    assert queue.drop(units[2].scenario.id) == units[2:4]
+    assert [queue.take(None) for _ in range(4)] == [units[1], *units[4:], None]
+
+
+TRIALS, COUNT = 2, 12
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return fake_dataset(tmp_path_factory.mktemp("fake") / "set", COUNT)
+
+
+class LazyHost(PushHost):
+    """Never moves: solves nothing."""
+
+    def act(self, observations, instructions, histories):
+        return [0 * chunk for chunk in super().act(observations, instructions, histories)]
+
+
+def evaluate(dataset, log, policy, host, against=""):
+    """A run as `roborecover eval` makes it, without LeRobot."""
+    scenarios, run = open_run(
+        RecoveryOptions(scenarios=str(dataset), trial_log=str(log)),
+        PlatformPart(SlotConfig("fake"), {}, None), workers=True,
+        facts=RunFacts(policy=policy, n_episodes=TRIALS),
+    )  # fmt: skip
+    run.pool.acquire()
+    try:
+        watch = open_watch(against, scenarios, run.protocol, TRIALS, log=run.log.path, shard="0/1")
+        units = units_of(list(scenarios) if watch is None else watch.order, TRIALS)
+        options = {"queue_of": OrderedQueue, "on_row": lambda r: watch.add([asdict(r)])} if watch else {}
+        if watch is not None:
+            watch.add([asdict(r) for r in run.log.rows])
+        stop = (lambda: watch.decided) if watch else (lambda: False)
+        # One slot: of several, one that starts late would let the others run ahead.
+        LocalEngine(run, host, slots=1, **options).run(units, stop)
+        if watch is not None:
+            watch.record(run.log.path)
+    finally:
+        run.pool.release()
+    return watch, read_trial_log(log)
+
+
+@pytest.fixture(scope="module")
+def stopped(dataset, tmp_path_factory):
+    """A policy that solves everything, a log of one that solves nothing, and a run of the former against
+    it."""
+    root = tmp_path_factory.mktemp("runs")
+    _, rows = evaluate(dataset, root / "lazy" / "trials.jsonl", "lazy@1", LazyHost())
+    assert not any(r.success for r in rows)
+    watch, rows = evaluate(dataset, root / "push" / "trials.jsonl", "push@1", PushHost(), str(root / "lazy"))
+    return root, watch, rows
+
+
+@pytest.mark.slow
+def test_a_run_stops_when_its_comparison_is_decided(stopped):
+    root, watch, rows = stopped
+    assert watch.decided
+    assert len(rows) < COUNT * TRIALS
+    assert f"of {COUNT} scenarios: better than lazy@1" in watch.words
+    record = read_record(root / "push" / "trials.jsonl")
+    assert (record.decided, record.policy, record.against) == (True, "push@1", "lazy@1")
+    assert record.after_scenarios < len(record.scenarios) == COUNT
+    assert record.p < 0.05
+    first = list(dict.fromkeys(r.scenario_id for r in rows))
+    assert set(record.scenarios[: record.after_scenarios]) <= set(first)
+    assert set(first) <= set(record.scenarios[: record.after_scenarios + 2]), "slots run ahead by little"
+
+
+def test_a_rerun_of_a_decided_comparison_runs_nothing(stopped, dataset):
+    root, _, rows = stopped
+    watch, again = evaluate(dataset, root / "push" / "trials.jsonl", "push@1", PushHost(), str(root / "lazy"))
+    assert watch.decided
+    assert again == rows
+
+
+def test_the_line_shows_what_holds_at_any_time(stopped, dataset, tmp_path):
+    watch, rows = evaluate(dataset, tmp_path / "trials.jsonl", "push@1", PushHost(), ALONE)
+    assert len(rows) == COUNT * TRIALS
+    assert watch.note == f"on {COUNT} of {COUNT} scenarios"
+    assert watch.interval[0] < watch.rate
+    assert not record_path(tmp_path / "trials.jsonl").exists()
+    assert "difference +" in stopped[1].note
+
+
+def test_a_scenario_counts_when_its_turn_has_come(dataset):
+    """Whatever ends early would otherwise count first, and successes end early."""
+    scenarios, run = open_run(
+        RecoveryOptions(scenarios=str(dataset), trial_log=str(dataset.parent / "turn.jsonl")),
+        PlatformPart(SlotConfig("fake"), {}, None), workers=True, facts=RunFacts(policy="a", n_episodes=1),
+    )  # fmt: skip
+    watch = open_watch(ALONE, scenarios, run.protocol, 1, log=run.log.path, shard="")
+    run.log.close()
+
+    def row(scenario):
+        return {"scenario_id": scenario.id, "trial": 0, "start": "recovery", "success": True}
+
+    watch.add([row(s) for s in watch.order[1:5]])
+    assert watch.rate is None
+    watch.add([row(watch.order[0])])
+    assert watch.note == f"on 5 of {COUNT} scenarios"
+
+
+def test_what_cannot_be_compared_is_refused(stopped, dataset, tmp_path):
+    root, _, _ = stopped
+    with pytest.raises(OptionError, match=r"lacks \d+ of the run's 12 scenarios"):
+        evaluate(dataset, tmp_path / "a.jsonl", "b@1", LazyHost(), str(root / "push"))
+    with pytest.raises(TrialLogError, match="cannot read trial log"):
+        evaluate(dataset, tmp_path / "b.jsonl", "b@1", LazyHost(), str(tmp_path / "none.jsonl"))
+    log = root / "lazy" / "trials.jsonl"
+    with pytest.raises(OptionError, match="the run's own log"):
+        evaluate(dataset, log, "lazy@1", LazyHost(), str(log))
+    rows = [r for p in ("a", "b") for r in policy_rows(p, 3, 1, 0.5, 0)]
+    with pytest.raises(OptionError, match="2 settings from recovery starts"):
+        evaluate(dataset, tmp_path / "c.jsonl", "b@1", LazyHost(), str(write_log(tmp_path / "two", rows)))
+
+
+def test_a_report_knows_a_run_that_stopped(stopped, dataset, tmp_path):
+    root, _, _ = stopped
+    evaluate(dataset, tmp_path / "third" / "trials.jsonl", "third@1", PushHost())
+    logs = [str(root / "push"), str(root / "lazy"), str(tmp_path / "third")]
+    for options in (Options(), Options(common=True), Options(scheduled=TRIALS)):
+        results = analyse(read_study(logs), options)
+        assert results.left_out == ("push@1",)
+        own = results.contrast("push@1", "lazy@1")
+        assert (own.verdict, own.sequential) == (Verdict.A_BETTER, True)
+        assert own.scenarios == read_record(root / "push" / "trials.jsonl").after_scenarios
+        assert own.family == 2
+        assert own.p <= own.p_holm
+        assert results.contrast("push@1", "third@1").verdict is Verdict.INCOMPLETE
+        p = results.recovery.arm("push@1")
+        assert (results.recovery.trials[p] > 0).sum() < COUNT, "what was not reached is no failure"
+        assert any("its run was watched, and decided after" in r for r in results.remarks)
+    pair = compare(read_study(logs[:2]))
+    assert pair.verdict == f"push@1 is better, by {100 * pair.contrast.difference.value:.1f} points."
+    assert "holds at every look (sequential)" in to_screen(pair)
+    assert analyse(read_study(logs[:1])).ranked.arms == ("push@1",)
+    folder = tmp_path / "board"
+    for log in logs:
+        shutil.copytree(log, folder / Path(log).name)
+    (board,) = make_leaderboard(folder).boards
+    entry = next(e for e in board.entries if e.policy == "push@1")
+    assert (entry.stopped, entry.place) == (True, None)
+
+
+def test_compare_sequential_counts_scenarios_in_their_turn(tmp_path, capsys):
+    rows = {p: policy_rows(p, 30, 2, rate, 0) for p, rate in (("a", 0.95), ("b", 0.05))}
+    names = sequence(f"scenario:{r.scenario_id}" for r in rows["a"])
+    order = [name.removeprefix("scenario:") for name in names]
+    first = [r for r in rows["a"] if r.scenario_id in order[:12]]
+    later = [r for r in rows["a"] if r.scenario_id in order[15:20]]
+    logs = [str(write_log(tmp_path / "a.jsonl", first + later))]
+    logs.append(str(write_log(tmp_path / "b.jsonl", rows["b"])))
+    found = compare(read_study(logs), options=Options(sequential=True)).contrast
+    assert found.sequential
+    assert found.scenarios <= 12
+    assert found.verdict is Verdict.A_BETTER
+    assert main(["compare", *logs, "--sequential"]) == 0
+    write_log(tmp_path / "a.jsonl", later)
+    assert main(["compare", *logs, "--sequential"]) == 2
+    assert "no scenario's turn has come" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("level", 7),
+        ("scenarios", ["a", "a"]),
+        ("scenarios", [1]),
+        ("trials", True),
+        ("p", "x"),
+        ("schema", 9),
+    ],
+)
+def test_a_damaged_record_is_refused_in_one_line(stopped, tmp_path, field, value):
+    text = json.loads(record_path(stopped[0] / "push" / "trials.jsonl").read_text())
+    record_path(tmp_path / "t.jsonl").write_text(json.dumps({**text, field: value}))
+    with pytest.raises(TrialLogError, match=rf"t.sequential.json: field '{field}'.*bring back"):
+        read_record(tmp_path / "t.jsonl")
+    record_path(tmp_path / "t.jsonl").write_text("[" * 100_000)
+    with pytest.raises(TrialLogError, match="bring back"):
+        read_record(tmp_path / "t.jsonl")

@@ -1,0 +1,320 @@
+"""HDF5 demonstrations and recorded rollouts to trajectory datasets, honest about what can be replayed."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
+from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
+from lerobot_roborecover.platforms.libero.init_states import read_init_states
+from lerobot_roborecover.scenario import ScenarioError
+from tests.support.conversion_scripts import script
+
+h5py = pytest.importorskip("h5py", reason="no h5py: pip install 'lerobot_env_roborecover[hdf5]'")
+pytestmark = pytest.mark.lerobot
+
+TASK = "put_the_bowl_on_the_plate"
+
+
+def libero_file(path, demos=2, steps=6, robomimic=False, dtype=np.float64, pause=True, init=True):
+    """A file as LIBERO writes it, or with robomimic's names."""
+    rng = np.random.default_rng(0)
+    state = read_init_states("libero_goal", TASK)[3]
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["bddl_file_name"] = f"libero/libero/bddl_files/libero_goal/{TASK}.bddl"
+        for i in range(demos):
+            demo = data.create_group(f"demo_{i}")
+            actions = rng.uniform(-1, 1, (steps, 7)).astype(dtype)
+            if pause:
+                actions[2, :6] = 0
+            demo["actions"] = actions
+            first = state.copy()
+            first[0] += 0.25
+            first[3] += 0 if init else 1e-6
+            demo["states"] = np.stack([first] + [state + 1] * (steps - 1))
+            demo["rewards"] = np.array([0] * (steps - 1) + [1], np.uint8)
+            pictures = rng.integers(0, 256, (steps, 32, 32, 3), dtype=np.uint8)
+            obs = demo.create_group("obs")
+            if robomimic:
+                obs["agentview_image"] = obs["robot0_eye_in_hand_image"] = pictures
+                obs["robot0_eef_pos"] = rng.uniform(-1, 1, (steps, 3))
+                obs["robot0_eef_quat"] = np.tile([0.0, 0.0, 0.0, 1.0], (steps, 1))
+                obs["robot0_gripper_qpos"] = rng.uniform(-1, 1, (steps, 2))
+            else:
+                obs["agentview_rgb"] = obs["eye_in_hand_rgb"] = pictures
+                obs["ee_states"] = rng.uniform(-1, 1, (steps, 6))
+                obs["gripper_states"] = rng.uniform(-1, 1, (steps, 2))
+    return path
+
+
+@pytest.mark.parametrize("robomimic", [False, True])
+def test_libero_demonstrations_become_rollouts_with_exact_actions(tmp_path, capsys, robomimic):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    path = libero_file(tmp_path / f"{TASK}_demo.hdf5", robomimic=robomimic)
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        "2 trajectories, 2 successful, 0 replayable exactly; 0 refused\n  2: fixture poses"
+        in capsys.readouterr().out
+    )
+    found = read_trajectories(tmp_path / "out")
+    dataset = LeRobotDataset("lab/x", root=tmp_path / "out")
+    with h5py.File(path) as file:
+        for i, actions in enumerate(found.actions()):
+            assert actions.tobytes() == file[f"data/demo_{i}/actions"][()].tobytes()
+        obs = file["data/demo_0/obs"]
+        place = obs["robot0_eef_pos"][1] if robomimic else obs["ee_states"][1][:3]
+        np.testing.assert_allclose(dataset[1]["observation.state"][:3], place, atol=1e-6)
+        # LeRobot shows policies the upright picture, the file holds it rotated by 180 degrees.
+        stored = obs["agentview_image" if robomimic else "agentview_rgb"][0][::-1, ::-1]
+        seen = dataset[0]["observation.images.image"].numpy().transpose(1, 2, 0) * 255
+        assert np.abs(seen - stored).mean() < np.abs(seen - stored[::-1, ::-1]).mean()
+    row = found.rows[0]
+    assert (row.task["suite"], row.task["name"], row.success, row.driver) == (
+        "libero_goal",
+        TASK,
+        True,
+        "human",
+    )
+    assert row.provenance == {"file": path.name, "episode": "demo_0", "init_state_index": 3}
+    assert row.not_replayable == "fixture poses are not recorded"
+
+
+def test_every_reason_against_an_exact_replay_is_named(tmp_path):
+    path = libero_file(tmp_path / "x.hdf5", demos=1, dtype=np.float32, pause=False, init=False)
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 0
+    (row,) = read_trajectories(tmp_path / "out").rows
+    assert row.not_replayable.split("; ") == [
+        "fixture poses are not recorded",
+        "actions are float32",
+        "no action is a no-op: they were probably taken out",
+        "the first state is none of the task's stored init states",
+    ]
+
+
+def test_a_bad_demonstration_is_named_and_the_rest_goes_on(tmp_path, capsys):
+    path = libero_file(tmp_path / "x.hdf5", demos=4)
+    secret = tmp_path / "secret.hdf5"
+    with h5py.File(secret, "w") as file:
+        file["actions"] = np.zeros((6, 7))
+    with h5py.File(path, "a") as file:
+        file["data/demo_0/actions"][3, 2] = np.nan
+        del file["data/demo_1/actions"]
+        file["data/demo_1/actions"] = h5py.ExternalLink(str(secret), "actions")
+        del file["data/demo_2/actions"]
+        file["data/demo_2/actions"] = np.zeros((6, 8))
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr()
+    for words in (
+        "demo_0/actions holds NaN",
+        "demo_1/actions is a link to another file",
+        "demo_2/actions has shape",
+    ):
+        assert words in said.err
+    assert "1 trajectories" in said.out
+
+
+@pytest.mark.parametrize("text", [b"", b"\x80\x04pickle", b"\x89HDF\r\n\x1a\n"])
+def test_what_is_no_hdf5_is_refused_and_leaves_nothing(tmp_path, capsys, text):
+    (tmp_path / "x.hdf5").write_bytes(text)
+    assert script("libero_hdf5").main([str(tmp_path / "x.hdf5"), "--out", str(tmp_path / "out")]) == 2
+    assert "cannot be opened as HDF5" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def jpeg(color) -> bytes:
+    """A picture as RoboTwin stores it: RGB given to an encoder that expects BGR."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGB", (32, 24), tuple(color[::-1])).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()
+
+
+def robotwin_folder(root, episodes=2, states=5):
+    folder = root / "stack_blocks_two" / "demo_clean"
+    (folder / "data").mkdir(parents=True)
+    (folder / "instructions").mkdir()
+    (folder / "seed.txt").write_text("7 11 ")
+    rng = np.random.default_rng(1)
+    for i in range(episodes):
+        said = {"seen": [f"seen {i}"], "unseen": [f"unseen {i}", "other"]}
+        (folder / "instructions" / f"episode{i}.json").write_text(json.dumps(said))
+        with h5py.File(folder / "data" / f"episode{i}.hdf5", "w") as file:
+            file["joint_action/vector"] = rng.uniform(-2, 2, (states, 14))
+            pictures = [jpeg((250, 20, 20)).ljust(2000, b"\0") for _ in range(states)]
+            for camera in ("head_camera", "left_camera", "right_camera"):
+                file.create_dataset(f"observation/{camera}/rgb", data=pictures, dtype="S2000")
+    return folder
+
+
+def test_robotwin_episodes_become_rollouts_that_say_they_cannot_be_replayed(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    folder = robotwin_folder(tmp_path)
+    assert script("robotwin_hdf5").main([str(folder), "--out", str(tmp_path / "out")]) == 0
+    found = read_trajectories(tmp_path / "out")
+    assert [r.provenance["seed"] for r in found.rows] == [7, 11]
+    assert [r.task["instruction"] for r in found.rows] == ["unseen 0", "unseen 1"]
+    assert {(r.task["suite"], r.task["horizon"]) for r in found.rows} == {("demo_clean", 800)}
+    assert all("not the commanded actions" in r.not_replayable for r in found.rows)
+    dataset = LeRobotDataset("lab/x", root=tmp_path / "out")
+    with h5py.File(folder / "data" / "episode0.hdf5") as file:
+        joints = file["joint_action/vector"][()]
+    assert found.actions()[0].tobytes() == joints[1:].tobytes()
+    np.testing.assert_allclose(dataset[0]["observation.state"], joints[0], atol=1e-6)
+    red, green, _ = dataset[0]["observation.images.head_camera"].numpy().mean(axis=(1, 2))
+    assert red > 0.8 > 0.3 > green
+
+
+@pytest.mark.parametrize("robomimic", [False, True])
+@pytest.mark.parametrize("observations", [12, 3])
+def test_actions_and_observations_of_other_numbers_are_refused_by_name(
+    tmp_path, capsys, robomimic, observations
+):
+    path = libero_file(tmp_path / "x.hdf5", demos=1, steps=observations, robomimic=robomimic)
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+        file["data/demo_0/actions"] = np.zeros((5, 7))
+        del file["data/demo_0/states"], file["data/demo_0/rewards"]
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert f"has {observations} rows, but there are 5 actions" in said
+    assert "demo_0/obs/agentview" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["states", "rewards"])
+def test_states_and_rewards_of_another_number_than_actions_are_refused(tmp_path, capsys, name):
+    path = libero_file(tmp_path / "x.hdf5", demos=1)
+    with h5py.File(path, "a") as file:
+        values = file[f"data/demo_0/{name}"][()]
+        del file[f"data/demo_0/{name}"]
+        file[f"data/demo_0/{name}"] = values[:-1]
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 2
+    assert f"demo_0/{name} has 5 rows, but there are 6 actions" in capsys.readouterr().err
+
+
+def test_robotwin_pictures_of_another_number_than_states_are_refused(tmp_path, capsys):
+    folder = robotwin_folder(tmp_path, episodes=1)
+    with h5py.File(folder / "data" / "episode0.hdf5", "a") as file:
+        pictures = file["observation/left_camera/rgb"][()]
+        del file["observation/left_camera/rgb"]
+        file["observation/left_camera/rgb"] = pictures[:3]
+    assert script("robotwin_hdf5").main([str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "left_camera/rgb has 3 rows, but there are 5 joint states" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["libero_hdf5", "robotwin_hdf5", "roborecover_release"])
+def test_a_licence_that_nobody_knows_is_refused_before_anything_is_read(tmp_path, capsys, name):
+    arguments = [str(tmp_path / "none"), "--out", str(tmp_path / "out"), "--license"]
+    with pytest.raises(SystemExit) as end:
+        script(name).main([*arguments, "cc-by-40"])
+    assert end.value.code == 2
+    assert "do you mean cc-by-4.0" in capsys.readouterr().err
+    assert script(name).main([*arguments, "CC-BY-4.0"]) == 2
+    assert "that the Hub knows" not in capsys.readouterr().err
+
+
+def test_robotwin_episodes_without_instruction_or_pictures_are_named(tmp_path, capsys):
+    folder = robotwin_folder(tmp_path, episodes=3)
+    (folder / "instructions" / "episode0.json").write_text("{}")
+    with h5py.File(folder / "data" / "episode1.hdf5", "a") as file:
+        del file["observation/head_camera/rgb"]
+    assert script("robotwin_hdf5").main([str(folder), "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "episode0.json, field unseen" in said
+    assert "observation/head_camera/rgb is missing" in said
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A dataset as `lerobot-eval --eval.recording=true` leaves it, on Meta-World."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path_factory.mktemp("recorded") / "recording"
+    features = {
+        "observation.image": {
+            "dtype": "video",
+            "shape": (32, 32, 3),
+            "names": ["height", "width", "channel"],
+        },
+        "observation.state": {"dtype": "float32", "shape": (4,), "names": None},
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("lab/recording", fps=80, features=features, root=root, use_videos=True)
+    rng = np.random.default_rng(2)
+    for episode in range(3):
+        for step in range(4 + episode):
+            dataset.add_frame(
+                {
+                    "observation.image": rng.integers(0, 256, (32, 32, 3), dtype=np.uint8),
+                    "observation.state": rng.uniform(-1, 1, 4).astype(np.float32),
+                    "action": rng.uniform(-1, 1, 4).astype(np.float32),
+                    "next.reward": np.zeros(1, np.float32),
+                    "next.success": np.array([episode == 1 and step == 4]),
+                    "next.done": np.zeros(1, bool),
+                    "task": task_by_name("metaworld", "button-press-v3").instruction,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def test_a_recording_of_lerobot_eval_becomes_rollouts(recorded, tmp_path, capsys):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    arguments = [str(recorded), "--platform", "metaworld", "--driver", "act", "--out", str(tmp_path / "out")]
+    assert script("lerobot_rollouts").main([*arguments, "--task", "button-press-v3"]) == 0
+    assert "3 trajectories, 1 successful, 0 replayable exactly; 0 refused" in capsys.readouterr().out
+    found = read_trajectories(tmp_path / "out")
+    assert [r.success for r in found.rows] == [False, True, False]
+    assert [r.steps for r in found.rows] == [4, 5, 6]
+    assert {r.not_replayable for r in found.rows} == {
+        "the recording does not name its reset (seed or init state)"
+    }
+    before = LeRobotDataset("lab/a", root=recorded)
+    after = LeRobotDataset("lab/b", root=tmp_path / "out")
+    assert len(after) == len(before)
+    exact = np.concatenate([actions for actions, _ in read_exact(tmp_path / "out")])
+    for i in (0, 7, 14):
+        np.testing.assert_array_equal(exact[i], before[i]["action"].numpy().astype(np.float64))
+        np.testing.assert_array_equal(after[i]["observation.image"], before[i]["observation.image"])
+
+
+def test_a_dataset_without_no_ops_and_with_another_width_is_told_apart(recorded, tmp_path, capsys):
+    copy = tmp_path / "some_no_noops"
+    shutil.copytree(recorded, copy)
+    convert = script("lerobot_rollouts").main
+    common = ["--driver", "act", "--out", str(tmp_path / "out")]
+    assert convert([str(copy), "--platform", "libero", *common]) == 2
+    assert "width 4; libero takes 7" in capsys.readouterr().err
+    assert convert([str(copy), "--platform", "metaworld", "--task", "button-press-v3", *common]) == 0
+    assert all("no-ops were taken out" in r.not_replayable for r in read_trajectories(tmp_path / "out").rows)
+    assert (
+        convert([str(tmp_path), "--platform", "metaworld", *common[:2], "--out", str(tmp_path / "o2")]) == 2
+    )
+    assert "meta/info.json" in capsys.readouterr().err
+
+
+def test_tasks_are_found_by_name_and_by_instruction():
+    assert task_by_name("libero", TASK).suite == "libero_goal"
+    assert task_by_instruction("libero", "Put the bowl  on the plate").name == TASK
+    assert task_by_name("robotwin", "open_microwave", "open it").horizon == 1500
+    for call, words in (
+        (lambda: task_by_name("libero", "fly"), "libero has no task 'fly'; there are "),
+        (lambda: task_by_name("robotwin", "../x"), "not one of RoboTwin's 50 tasks"),
+        (lambda: task_by_instruction("libero", "fly"), "0 tasks"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            call()

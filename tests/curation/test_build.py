@@ -1,0 +1,319 @@
+"""The chain from one file: what is refused, what runs again, and that it can be stopped anywhere."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
+from lerobot_roborecover.curation.annotation.votes import Vote
+from lerobot_roborecover.curation.attrition import Decision, StageCounts, record_decisions
+from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.pipeline.config import read_config
+from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting
+from lerobot_roborecover.curation.pipeline.summary import markdown
+from lerobot_roborecover.datasets import read_scenarios
+from lerobot_roborecover.datasets.video_frames import check_frames
+from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.journal import Journal
+from lerobot_roborecover.scenario import ScenarioError
+
+EXAMPLE = Path(__file__).parents[2] / "policies" / "build" / "metaworld.yaml"
+FAKE = {
+    "platform": "fake",
+    "collect": {
+        "biased": {"expert": "expert_biased", "task": ["push-*"], "draw": 4, "frames": 32, "slots": 1},
+        "shaken": {
+            "expert": "expert_biased", "task": ["push-left"], "draw": 2, "perturb": True, "frames": 32,
+            "slots": 1,
+        },
+    },
+    "screen": {"trials": 2, "keep": [0, 99], "slots": 1},
+    "validate": {"runs": 2, "workers": 2},
+    "split": {"sizes": {"train": 0.5, "test": 0.5}},
+    "render": {"frames": 64},
+}  # fmt: skip
+
+
+def write(path: Path, content: dict) -> Path:
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def changed(content: dict, key: str, value) -> dict:
+    """A copy with one entry, `a.b.c`, set or, with None, taken out."""
+    content = json.loads(json.dumps(content))
+    *path, last = key.split(".")
+    node = content
+    for part in path:
+        node = node.setdefault(part, {})
+    node.pop(last, None) if value is None else node.update({last: value})
+    return content
+
+
+WHOLE = {**FAKE, "out": "x", "screen": {**FAKE["screen"], "policies": [{"path": "p"}]}}
+
+
+@pytest.mark.lerobot
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("colect", {}, "unknown key colect; did you mean collect?"),
+        ("screen.trails", 5, "unknown key screen.trails; did you mean trials?"),
+        ("collect.biased.perturbed", True, "unknown key collect.biased.perturbed; did you mean perturb"),
+        ("publish.repo", "a/b", "unknown key publish.repo; did you mean repo_id"),
+        ("out", None, "out is missing"),
+        ("platform", "mars", "'mars' is not one of libero"),
+        ("collect", {}, "collect is empty"),
+        ("collect.biased.policy", "p", "give one of dataset, policy and expert"),
+        ("collect.shaken", {"dataset": "d", "draw": 3}, "leave out draw"),
+        ("collect.a/b", {"expert": "x"}, "a name is letters"),
+        ("screen.policies", None, "screen.policies is empty"),
+        ("screen.policies", [{"name": "a"}], "path is missing"),
+        ("screen.policies", [{"path": "a", "options": {"k": 1}}], "need a name"),
+        ("screen.policies", [{"pth": "a"}], "unknown key screen.policies.0.pth; did you mean path"),
+        ("screen.keep", [1], "two numbers"),
+        ("screen.trials", "many", "trials"),
+        ("split.sizes", {"train": 1}, "at least two splits"),
+        ("annotate.no_consensus", "vote", "drop or discuss"),
+        ("publish", {}, "repo_id is missing"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, key, value, words):
+    with pytest.raises(OptionError, match=r"build\.yaml") as caught:
+        read_config(write(tmp_path / "build.yaml", changed(WHOLE, key, value)))
+    assert words in str(caught.value), str(caught.value)
+
+
+@pytest.mark.lerobot
+def test_the_example_can_be_read_and_tried(tmp_path, monkeypatch, capsys):
+    read_config(write(tmp_path / "whole.yaml", WHOLE))
+    config = read_config(EXAMPLE)
+    assert config.split.sizes == {"train": 0.8, "test": 0.2}
+    monkeypatch.chdir(tmp_path)
+    assert main(["build", str(EXAMPLE), "--dry-run"]) == 2, "its checkpoints are not here"
+    said = capsys.readouterr()
+    assert said.out.count("would run") == 9
+    assert "[stage 4 of 9, 0:00:0" in said.out
+    assert said.err.count("pretrained_model") >= 3
+    for text, words in (("- a\n", "not a map"), ("a: [", "not YAML")):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(OptionError, match=words):
+            read_config(tmp_path / "bad.yaml")
+    with pytest.raises(OptionError, match="--from nowhere: not one of"):
+        Chain(config, lambda argv: 0).build("nowhere")
+    with pytest.raises(OptionError, match="come in the order"):
+        Chain(config, lambda argv: 0).build("split", "collect")
+
+
+def test_the_funnel_as_markdown():
+    text = markdown([StageCounts("collect", 5, 3, (("stuck | jammed", 2),), 0)])
+    assert "| collect | 5 | 3 | 2 | 0 |" in text
+    assert "| collect | 2 | stuck / jammed |" in text
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """A chain whose commands only make their folders, and whose candidates are there."""
+    from tests.support.candidate_files import candidate_dataset
+
+    monkeypatch.setattr(
+        "lerobot_roborecover.curation.pipeline.stages.merge_candidates",
+        lambda folder, sources: shutil.copytree(sources[0], folder),
+    )
+    candidate_dataset(tmp_path / "rollouts", 3)
+    content = {
+        "out": str(tmp_path / "out"), "platform": "fake",
+        "collect": {"mine": {"dataset": str(tmp_path / "rollouts")}},
+        "screen": {"policies": [{"path": "p"}]}, "split": {"sizes": {"train": 0.5, "test": 0.5}},
+    }  # fmt: skip
+    calls: list[list[str]] = []
+
+    def command(argv: list[str]) -> int:
+        calls.append(argv)
+        if "--out" in argv:
+            Path(argv[argv.index("--out") + 1]).mkdir()
+        return build.status
+
+    def build(*args, content=content, **kwargs) -> list[str]:
+        calls.clear()
+        config = read_config(write(tmp_path / "build.yaml", content))
+        Chain(config, command, lambda line: None).build(*args, **kwargs)
+        return [argv[0] for argv in calls]
+
+    build.root, build.content, build.calls, build.status = tmp_path / "out", content, calls, 0
+    return build
+
+
+def test_what_runs_again(stand_in):
+    build = stand_in
+    with pytest.raises(Waiting, match=r"3 candidates wait for votes \(3 each\)"):
+        build()
+    with pytest.raises(Waiting):
+        build()
+    assert not (build.root / "old").exists(), "what is unchanged is left alone while people are waited for"
+    assert vote_for_all(build.root) == 3
+    assert build(dry_run=True) == []
+    assert build("", "agree") == ["agree"]
+    assert build() == ["screen", "validate", "split", "render"]
+    assert build.calls[0][:5] == [
+        "screen",
+        str(build.root / "scenarios"),
+        "--out",
+        str(build.root / "screened"),
+        "--policy",
+    ]
+    assert build() == []
+    assert build("validate") == ["validate", "split", "render"]
+    assert build("", "screen") == []
+    seed = changed(build.content, "split.seed", 7)
+    assert build(content=seed) == ["split", "render"]
+    assert build.calls[0][-2:] == ["--seed", "7"]
+    assert build(content=changed(seed, "screen.slots", 9)) == [], "a pace is no change"
+    assert build(content=changed(seed, "screen.keep", [2, 18])) == ["screen", "validate", "split", "render"]
+    assert build.calls[0][-3:] == ["--keep", "2", "18"]
+    assert build(content=changed(seed, "screen.keep", [0.1, 0.9])) == [
+        "screen",
+        "validate",
+        "split",
+        "render",
+    ]
+    assert build.calls[0][-3:] == ["--keep", "0.1", "0.9"]
+    build(content=seed)
+    assert build(content=changed(seed, "publish.repo_id", "a/b"))[-1] == "publish"
+    # Votes, rejections and decisions of people count; a result that is gone is made again.
+    content = changed(seed, "publish.repo_id", "a/b")
+    with Journal(build.root / "votes" / "ann.jsonl", VOTES_SCHEMA) as journal:
+        journal.append(vote("ep-0000", "ann") | {"uid": "second-thoughts"})
+    assert build(content=content) == ["agree", "screen", "validate", "split", "render", "publish"]
+    with Journal(build.root / "validated.replays" / "rejects.jsonl", 1) as journal:
+        journal.append({"id": "ep-0000", "rejected": True})
+    assert build(content=content) == ["validate", "split", "render", "publish"]
+    shutil.rmtree(build.root / "split")
+    assert build(content=content) == ["split"]
+    record_decisions(
+        Path(content["collect"]["mine"]["dataset"]), [Decision("ep-0001", "collect", "dropped", "x")]
+    )
+    assert build(content=content) == ["agree", "screen", "validate", "split", "render", "publish"]
+    assert len(list((build.root / "old").iterdir())) > 5, "nothing is deleted"
+    assert build(content=content) == []
+
+
+def test_a_stage_that_ends_in_an_error_is_not_recorded(stand_in):
+    build = stand_in
+    with pytest.raises(Waiting):
+        build()
+    vote_for_all(build.root)
+    build.status = 2
+    with pytest.raises(ScenarioError, match="`roborecover agree` ended with status 2"):
+        build()
+    build.status = 0
+    assert build() == ["agree", "screen", "validate", "split", "render"]
+    with Journal(build.root / "stages.jsonl", 1), pytest.raises(ScenarioError, match="in use by another"):
+        build()
+
+
+def vote_for_all(root: Path) -> int:
+    """Three annotators mark the same everywhere; the last one discards the first candidate, alone."""
+    candidates = read_candidates(root / "candidates")
+    for name in ("ann", "bob", "cleo"):
+        with Journal(root / "votes" / f"{name}.jsonl", VOTES_SCHEMA) as journal:
+            journal.append(*(vote(c.id, name) for c in candidates.candidates))
+    return len(candidates)
+
+
+def vote(candidate: str, name: str) -> dict:
+    made = Vote(
+        f"{name}-{candidate}", candidate, "recovery", 12, "Approach", "Wrong Pose", annotator=name,
+        at="2026-01-02T03:04:05+00:00",
+    )  # fmt: skip
+    return {"kind": "vote", **asdict(made)}
+
+
+@pytest.fixture
+def build(tmp_path, monkeypatch):
+    """Runs the command with a content; counts what was loaded."""
+    from tests.support.push_checkpoints import load_push_host, push_checkpoints
+
+    loads = []
+    monkeypatch.setattr(
+        "lerobot_roborecover.trials.load.load_host", lambda c: loads.append(c) or load_push_host(c)
+    )
+    policies = [{"path": str(p), "name": p.name} for p in push_checkpoints(tmp_path / "policies")[:2]]
+    whole = {**FAKE, "out": str(tmp_path / "out"), "screen": {**FAKE["screen"], "policies": policies}}
+
+    def run(*args: str, content: dict = whole) -> int:
+        return main(["build", str(write(tmp_path / "build.yaml", content)), *args])
+
+    run.whole, run.loads, run.root = whole, loads, tmp_path / "out"
+    return run
+
+
+def ran(text: str) -> list[str]:
+    return [line[line.index("] ") + 2 : -6] for line in text.splitlines() if line.endswith(": runs")]
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_from_rollouts_to_episodes(build, capsys):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    assert build("--until", "collect") == 0
+    assert ran(capsys.readouterr().out) == ["collect biased", "collect shaken"]
+    # People are waited for, as often as it takes.
+    for _ in range(2):
+        assert build() == 1
+        text = capsys.readouterr().out
+        assert "wait for votes (3 each)" in text
+    assert ran(text) == ["annotate"]
+    count = vote_for_all(build.root)
+    assert build() == 0
+    text = capsys.readouterr().out
+    assert ran(text) == ["annotate", "agree", "screen", "validate", "split", "render"]
+    assert f"to publish: roborecover publish {build.root / 'rendered'} --repo-id ORG/NAME" in text
+    final = read_scenarios(build.root / "split")
+    assert 4 <= len(final) <= count
+    assert {s.split for s in final} == {"train", "test"}
+    for scenario in final:
+        assert set(scenario.provenance) >= {"annotation", "screening", "validation", "rollout"}
+        assert scenario.provenance["validation"]["mean_ssim"] > 0.99
+    rendered = LeRobotDataset("lab/rendered", root=build.root / "rendered")
+    assert rendered.num_episodes == len(final)
+    assert check_frames(build.root / "rendered", [len(s.prefix) for s in final], thorough=True)
+    assert [s.sha256() for s in read_scenarios(build.root / "rendered")] == [s.sha256() for s in final]
+    funnel = (build.root / "summary" / "funnel.md").read_text()
+    for stage in ("collect", "annotate", "screen", "validate", "split"):
+        assert f"| {stage} |" in funnel
+    assert (build.root / "summary" / "build.yaml").is_file()
+    assert "leakage by trajectory: none" in (build.root / "summary" / "splits.txt").read_text()
+
+    # Nothing has changed, nothing runs; a faster pace is no change.
+    loads = len(build.loads)
+    assert build(content=changed(build.whole, "validate.workers", 1)) == 0
+    assert ran(capsys.readouterr().out) == []
+    # What is changed is made anew, with all after it, from the trials and replays that are there.
+    replays = (build.root / "validated.replays" / "replays.jsonl").read_bytes()
+    assert build(content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    text = capsys.readouterr().out
+    assert ran(text) == ["screen", "validate", "split", "render"]
+    assert len(build.loads) == loads, "no trial runs again"
+    assert (build.root / "validated.replays" / "replays.jsonl").read_bytes() == replays
+    assert sorted(p.name for p in (build.root / "old").iterdir()) == [
+        "rendered-1",
+        "screened-1",
+        "split-1",
+        "validated-1",
+    ]
+    assert build("--from", "split", content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    assert ran(capsys.readouterr().out) == ["split", "render"]
+    # A later vote counts.
+    with Journal(build.root / "votes" / "ann.jsonl", VOTES_SCHEMA) as journal:
+        journal.append(vote(final[0].id, "ann") | {"uid": "second-thoughts"})
+    assert build("--until", "agree", content=changed(build.whole, "screen.max_invalid", 1)) == 0
+    assert ran(capsys.readouterr().out) == ["agree"]

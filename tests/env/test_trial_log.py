@@ -1,0 +1,120 @@
+"""The trial log keeps every complete line and refuses what it cannot trust."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from lerobot_roborecover.env.trial_log import (
+    Protocol,
+    TrialLog,
+    TrialLogError,
+    make_row,
+    read_trial_log,
+    trial_seed,
+)
+from lerobot_roborecover.scenario import Outcome
+from tests.support.factories import fake_scenario
+
+PROTOCOL = Protocol("recovery", 0, "push@1", 1000, 10)
+
+
+def row(trial: int, outcome: Outcome = Outcome.SUCCESS, protocol: Protocol = PROTOCOL):
+    return make_row(
+        fake_scenario(0), protocol, dataset="d", dataset_revision=None, trial=trial,
+        noise="per_trial", batch_size=1,
+        outcome=outcome, reason="", steps=7, handoff=None, sim_s=0.1, policy_s=0.2, actions_sha256="",
+    )  # fmt: skip
+
+
+def written(path, *rows):
+    log = TrialLog(path)
+    for r in rows:
+        log.append(r)
+    log.close()
+    return path
+
+
+def test_rows_come_back_as_written(tmp_path):
+    path = written(tmp_path / "deep" / "log.jsonl", row(0), row(1, Outcome.HORIZON))
+    assert read_trial_log(path) == [
+        row(0).__class__(**json.loads(line)) for line in path.read_text().splitlines()
+    ]
+    assert [r.trial for r in read_trial_log(path)] == [0, 1]
+
+
+@pytest.mark.parametrize("cut", [1, 5, 200])
+def test_a_cut_last_line_is_dropped_and_its_trial_can_be_written_again(tmp_path, cut):
+    path = written(tmp_path / "log.jsonl", row(0), row(1))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-cut])
+    assert [r.trial for r in read_trial_log(path)] == [0]
+    log = TrialLog(path)
+    assert log.dropped_bytes > 0
+    log.append(row(1))
+    log.close()
+    assert [r.trial for r in read_trial_log(path)] == [0, 1]
+
+
+def test_a_damaged_line_in_the_middle_is_refused_by_line(tmp_path):
+    path = written(tmp_path / "log.jsonl", row(0), row(1))
+    lines = path.read_text().splitlines()
+    path.write_text(lines[0][:40] + "\n" + lines[1] + "\n")
+    with pytest.raises(TrialLogError, match="line 1: not a JSON trial row"):
+        TrialLog(path)
+
+
+def test_two_outcomes_for_one_trial_are_an_error(tmp_path):
+    path = written(tmp_path / "log.jsonl", row(0))
+    other = written(tmp_path / "other.jsonl", row(0, Outcome.HORIZON))
+    path.write_text(path.read_text() + other.read_text())
+    with pytest.raises(TrialLogError, match=r"line 2: field 'outcome': trial 0 .* 'horizon' .* 'success'"):
+        read_trial_log(path)
+
+
+def test_a_log_in_use_is_refused(tmp_path):
+    log = TrialLog(tmp_path / "log.jsonl")
+    with pytest.raises(TrialLogError, match="in use by another process"):
+        TrialLog(tmp_path / "log.jsonl")
+    log.close()
+    TrialLog(tmp_path / "log.jsonl").close()
+
+
+def test_a_future_schema_and_unknown_fields_are_refused(tmp_path):
+    path = written(tmp_path / "log.jsonl", row(0))
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record | {"schema": 99}) + "\n")
+    with pytest.raises(TrialLogError, match="schema 99"):
+        read_trial_log(path)
+    path.write_text(json.dumps(record | {"colour": "red"}) + "\n")
+    with pytest.raises(TrialLogError, match="'colour'"):
+        read_trial_log(path)
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(b"\x80\x02\xff\xfe binary\n")
+    with pytest.raises(TrialLogError, match="not UTF-8"):
+        TrialLog(path)
+
+
+def test_what_decides_a_result_decides_the_key():
+    keys = {
+        row(0).key(),
+        row(1).key(),
+        row(0, protocol=Protocol("initial", 0, "push@1", 1000, 10)).key(),
+        row(0, protocol=Protocol("recovery", 0, "push@2", 1000, 10)).key(),
+        row(0, protocol=Protocol("recovery", 0, "push@1", 1001, 10)).key(),
+        row(0, protocol=Protocol("recovery", 0, "push@1", 1000, 5)).key(),
+        row(0, protocol=Protocol("recovery", 0, "push@1", 1000, 10, {"size": 64})).key(),
+        row(0, protocol=Protocol("recovery", 0, "push@1", 1000, 10, {}, {"mujoco": "3.3.2"})).key(),
+    }
+    assert len(keys) == 8
+
+
+def test_trial_seeds_differ_in_all_three_arguments():
+    seeds = {trial_seed(s, i, k) for s in (0, 1) for i in ("a", "b") for k in (0, 1)}
+    assert len(seeds) == 8
+    assert all(0 <= s < 2**63 for s in seeds)
+    assert trial_seed(None, "a", 0) is None

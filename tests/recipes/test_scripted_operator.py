@@ -1,0 +1,90 @@
+"""The scripted operator: its deviations on the real simulator, and what the rules call them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lerobot_roborecover.curation.annotation.annotators import EYES
+from lerobot_roborecover.curation.annotation.looking import Look, Sheet, frames_to_look_at
+from lerobot_roborecover.curation.annotation.rules import judge
+from lerobot_roborecover.curation.annotation.traces import traces
+from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.scenario import Reset
+
+pytestmark = pytest.mark.metaworld
+STOP = 56
+
+
+class Recorder:
+    """Controls of a simulator at hand, which records what is done with them."""
+
+    def __init__(self, simulator):
+        self.simulator, self.actions, self.poses, self.solved = simulator, [], [], []
+        self._record()
+
+    def _record(self) -> None:
+        self.poses.append(self.simulator.bodies())
+        self.solved.append(self.simulator.succeeded())
+
+    def low_dim(self) -> np.ndarray:
+        return self.simulator.low_dim()
+
+    def point(self, name: str) -> np.ndarray:
+        return np.array(self.poses[-1][name].position_m)
+
+    def names(self) -> list[str]:
+        return list(self.poses[-1])
+
+    def act(self, action: np.ndarray) -> bool:
+        self.simulator.step(action)
+        self.actions.append(action)
+        self._record()
+        return self.solved[-1]
+
+    def look(self, eye: str) -> Look:
+        """The recording as the page shows it."""
+        count = len(self.actions)
+        poses = {
+            n: np.array([[*p[n].position_m, *p[n].quat_xyzw] for p in self.poses]) for n in self.poses[0]
+        }
+        steps = Steps(poses, np.array(self.solved), np.zeros(count, np.int8))
+        shown = traces("metaworld", np.array(self.actions), steps, 80)
+        look = Look(Sheet("it", "", count - 1, 80.0, False, human=True))
+        for f in frames_to_look_at(EYES[eye].first_look, 80, count - 1):
+            hand = {"speed": shown.eef_speed_m_s[f], "a3": shown.gripper["a3"][f]}
+            look.readings[f] = {"hand": hand}
+            for name, place in shown.places.items():
+                values = {"reach": place.reach_m, "moved": place.moved_m, "height": place.height_m}
+                values |= {} if place.goal_m is None else {"goal": place.goal_m}
+                look.readings[f][name] = {key: float(v[f]) for key, v in values.items()}
+        return look
+
+
+@pytest.mark.parametrize(
+    ("task", "way"),
+    [
+        ("push-v3", "dropped"),
+        ("push-v3", "too-high"),
+        ("hammer-v3", "wrong-place"),
+        ("hammer-v3", "wrong-part"),
+    ],
+)
+def test_a_deviation_is_what_the_rules_call_it(task, way):
+    from lerobot_roborecover.platforms.metaworld import PLATFORM
+    from lerobot_roborecover.platforms.metaworld.experts import expert
+    from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
+    from recipes.metaworld.deviations import DEVIATIONS, Hand
+
+    simulator = MetaworldSimulator(obs_type="state")
+    simulator.reset(PLATFORM.task(task), Reset(seed=500))
+    controls, how = Recorder(simulator), DEVIATIONS[way]
+    hand = Hand(controls, expert(controls, task), np.random.default_rng(1))
+    how.make(hand)
+    began = len(controls.actions)
+    hand.hold(STOP, how.grip)
+    found = judge(controls.look("auto-1"), EYES["auto-1"])
+    simulator.close()
+    assert (found.stage, found.deviation) == (how.stage, how.deviation)
+    # The hand is slow before it stands still.
+    assert began - 25 <= found.step <= began + 25

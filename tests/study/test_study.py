@@ -1,0 +1,183 @@
+"""`roborecover study`: commands, stored outcomes, refusals; and a whole small study on the fake simulator."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.arms import arms
+from lerobot_roborecover.study.definition import read_definition
+from lerobot_roborecover.study.evaluate import compare_with_stored
+from lerobot_roborecover.study.make import POLICIES, chain_for, stages
+from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
+from tests.support.factories import fake_dataset, save_policy
+
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """A study's folder on the fake simulator, without its definition."""
+    root = tmp_path_factory.mktemp("study")
+    fake_dataset(root / "scenarios", COUNT, horizon=12)
+    save_policy(root / "policies" / "act", "act")
+    shutil.copytree(root / "policies" / "act", root / "policies" / "other")
+    return root
+
+
+@pytest.fixture
+def study(parts, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(parts, root)
+    define(root)
+    return root
+
+
+def define(root, **changes) -> None:
+    found = {
+        "schema_version": 1, "platform": "fake", "policies": {"act": 1, "other": 2}, "base": "act",
+        "interventions": ["reversion"], "environment": {"OMP_NUM_THREADS": "1"},
+    }  # fmt: skip
+    (root / "study.json").write_text(json.dumps({**found, **changes}))
+
+
+def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
+    found = list(arms(read_definition(study), tmp_path / "out"))
+    labels = [a.label for a in found]
+    assert labels == [
+        "act/recovery", "act/initial", "other/recovery", "other/initial", "reversion/recovery"
+    ]  # fmt: skip
+    assert [a.trials for a in found] == [1, 1, 2, 2, 1]
+    assert all(a.run.runner["max_batch"] == 1 for a in found)
+    assert all("--runner.portable=true" in a.run.command_line() for a in found)
+    assert f"--policy.base.path={study / 'policies' / 'act'}" in found[-1].run.command_line()
+
+
+@pytest.mark.nightly
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
+    define(study, policies={"act": 2}, interventions=[])
+    out = tmp_path / "out"
+    command = ["study", "--data", str(study), "--out", str(out), "--slots", "1"]
+    assert main([*command, "--no-report"]) == 0
+    said = capsys.readouterr().out
+    assert "[2/2] act/" in said
+    assert "act/initial: 8 trials" in said
+    outcomes = read_outcomes(out / "outcomes.csv")
+    assert len(outcomes) == COUNT * (2 + 2)
+
+    # Stored, and run again: elsewhere, with more simulators, on a part of the scenarios.
+    write_outcomes(study / "outcomes.csv", outcomes)
+    again = ["study", "--data", str(study), "--out", str(tmp_path / "again"), "--slots", "2", "--every", "2"]
+    assert main([*again, "--no-report"]) == 0
+    assert "8 of 8 trials came out as stored" in capsys.readouterr().out
+
+    # A stored outcome that is another one is told apart, and what has finished is not run again.
+    key = next(k for k in outcomes if k[0] == "act/recovery")
+    write_outcomes(study / "outcomes.csv", {**outcomes, key: ("success", 3)})
+    before = (out / "trials" / "act-recovery" / "output.log").stat().st_mtime_ns
+    assert main(command) == 1
+    assert (out / "trials" / "act-recovery" / "output.log").stat().st_mtime_ns == before
+    assert f"act/recovery {key[1]} trial {key[2]}: stored success after 3" in capsys.readouterr().out
+    assert (out / "report" / "report.html").exists()
+
+
+trial = st.tuples(st.sampled_from(["a/recovery", "b"]), st.text('abc," \n', min_size=1), st.integers(0, 9))
+outcome = st.tuples(st.sampled_from(["success", "horizon"]), st.integers(0, 500))
+
+
+@given(st.dictionaries(trial, outcome))
+def test_outcomes_survive_their_file(tmp_path_factory, outcomes):
+    path = tmp_path_factory.mktemp("outcomes") / "outcomes.csv"
+    write_outcomes(path, outcomes)
+    assert read_outcomes(path) == outcomes
+
+
+@given(st.dictionaries(trial, outcome), st.dictionaries(trial, outcome))
+def test_each_trial_of_today_is_counted_once(stored, today):
+    found = compare(stored, today)
+    assert found.same + len(found.different) + found.unknown == len(today)
+    assert all(stored[key] == a and today[key] == b and a != b for key, a, b in found.different)
+
+
+def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, monkeypatch):
+    stored = {("act", "s", i): (o, n) for i, (o, n) in enumerate([("success", 20), ("horizon", 45)] * 2)}
+    today = {**stored, ("act", "s", 0): ("success", 22), ("act", "s", 2): ("success", 17)}
+    write_outcomes(study / "outcomes.csv", stored)
+    found = read_definition(study)
+    monkeypatch.setattr("lerobot_roborecover.study.evaluate.outcomes_of", lambda done: today)
+    for can, different, close in ((True, {0, 2}, set()), (False, {2}, {0})):
+        monkeypatch.setattr("lerobot_roborecover.study.evaluate.has_kernels", lambda can=can: can)
+        compared = compare_with_stored(found, [])
+        assert ({d[0][2] for d in compared.different}, {d[0][2] for d in compared.close}) == (
+            different,
+            close,
+        )
+        assert compared.text().startswith("2 of 4 trials came out as stored, to the step")
+    assert "1 more ended alike, at most 2 steps sooner or later" in compared.text()
+    # An outcome is never close to another one, however near the steps.
+    other = compare({("a", "s", 0): ("success", 45)}, {("a", "s", 0): ("horizon", 45)}, 10)
+    assert (len(other.different), len(other.close)) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema_version": 9}, "field schema_version: 9"),
+        ({"policies": {}}, "field policies"),
+        ({"policies": {"../act": 1}}, "field policies: '../act'"),
+        ({"policies": {"act": 0}}, "field policies.act: 0; it must be a count from 1 to 1000"),
+        ({"policies": {"act": 1, "missing": 1}}, "names policy missing"),
+        ({"base": "nobody"}, "field base: 'nobody'; it must be one of"),
+        ({"interventions": ["human"]}, "field interventions: 'human'"),
+        ({"interventions": ["correction"]}, "mode correction needs a correction"),
+        ({"env": {"obs_type": 3}}, "field env"),
+        ({"colour": "red"}, "not a study's definition"),
+    ],
+)  # fmt: skip
+def test_a_definition_that_cannot_be_used(study, changes, message):
+    define(study, **changes)
+    with pytest.raises(ScenarioError, match=r"study\.json") as caught:
+        read_definition(study)
+    assert message in str(caught.value)
+
+
+def test_refusals(study, tmp_path, capsys):
+    def refused(*argv: str) -> str:
+        assert main(["study", *argv]) == 2
+        return capsys.readouterr().err
+
+    assert "has no study.json" in refused("--data", str(tmp_path))
+    assert "--every=0: a count from 1" in refused("--data", str(study), "--every", "0")
+    assert "--jobs=-1: a count" in refused("--data", str(study), "--jobs", "-1")
+    assert "add --make" in refused("--stage", "policies")
+    (study / "outcomes.csv").write_text("arm,scenario_id,trial,outcome,steps\na,b,c,d,e\n")
+    with pytest.raises(ScenarioError, match="line 2"):
+        read_outcomes(study / "outcomes.csv")
+
+
+@pytest.mark.lerobot
+def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path, capsys):
+    define(study, policies={"act": 1}, interventions=[])
+    (study / "policies" / "act" / "config.json").write_text("{}")
+    assert main(["study", "--data", str(study), "--out", str(tmp_path / "out"), "--no-report"]) == 2
+    message = capsys.readouterr().err
+    assert "ended with status" in message
+    assert "Run the same command again" in message
+
+
+def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
+    found = stages(tmp_path, chain_for(tmp_path))
+    assert [s.name for s in found] == [
+        "policies", "driven1", "driven2", "scenarios", "donors", "correction", "monitor data", "monitor",
+        "monitor metrics",
+    ]  # fmt: skip
+    assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
+    assert {path.name for path in found[0].done} == set(POLICIES), "none of them is forgotten"

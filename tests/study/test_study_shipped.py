@@ -1,0 +1,55 @@
+"""The shipped study: trials come out as stored, to the step. Nightly: one that a bit decides, and a slice."""
+
+from __future__ import annotations
+
+import pytest
+
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.study.arms import arms
+from lerobot_roborecover.study.definition import read_definition, shipped_study
+from lerobot_roborecover.study.evaluate import compare_with_stored, run_arm, scenario_ids
+from lerobot_roborecover.study.outcomes import read_outcomes
+
+EVERY = 32
+"""Two of the test scenarios: policies from both starts, and all interventions."""
+
+
+@pytest.fixture(scope="module")
+def study():
+    return read_definition(shipped_study())
+
+
+def test_every_trial_of_the_shipped_study_is_stored(study):
+    stored = read_outcomes(study.outcomes)
+    ids = scenario_ids(study, 1)
+    arms = {(f"{name}/{start}", n) for name, n in study.policies.items() for start in ("recovery", "initial")}
+    arms |= {(f"{mode}/recovery", study.policies[study.base]) for mode in study.interventions}
+    assert set(stored) == {(arm, i, t) for arm, trials in arms for i in ids for t in range(trials)}
+    assert all(outcome in ("success", "horizon") for outcome, _ in stored.values())
+
+
+@pytest.mark.nightly
+@pytest.mark.lerobot
+@pytest.mark.metaworld
+@pytest.mark.slow
+def test_a_trial_that_a_bit_decides_comes_out_as_stored(study, tmp_path):
+    """One step sooner on an AMD EPYC than on an Intel processor, as long as MKL took the square roots of its
+    noise schedule in float32 (`trials/portable.py`), and with other kernels of MKL."""
+    ids = ["scripted-operator-push-v3-s502-000049"]
+    (arm,) = (a for a in arms(study, tmp_path, ids, slots=1) if a.label == "diffusion/initial")
+    run_arm(arm, study)
+    compared = compare_with_stored(study, [arm])
+    assert (compared.same, compared.different, compared.unknown) == (study.policies["diffusion"], (), 0)
+
+
+@pytest.mark.lerobot
+@pytest.mark.metaworld
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_a_slice_comes_out_as_stored(study, tmp_path, capsys):
+    status = main(["study", "--every", str(EVERY), "--out", str(tmp_path), "--no-report"])
+    said = capsys.readouterr().out
+    trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
+    total = trials * len(scenario_ids(study, EVERY))
+    assert status == 0, said
+    assert f"{total} of {total} trials came out as stored, to the step" in said

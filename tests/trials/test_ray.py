@@ -1,0 +1,167 @@
+"""A Ray cluster of two nodes on this machine gives the same rows, also when one node dies in the middle."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lerobot_roborecover.env.facts import RunFacts
+from lerobot_roborecover.env.options import OptionError, RecoveryOptions
+from lerobot_roborecover.env.run import PlatformPart, open_run
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.workers.messages import SlotConfig
+from tests.support.factories import fake_dataset, save_policy
+from tests.support.loop import evaluate, outcomes
+from tests.trials.test_local_engine import PushHost
+
+pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.nightly]
+
+TRIALS = 4
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head with two CPUs and a second node with two, which the last test takes away."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    small = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        # Actors import the tests' own policy.
+        patch.setenv("PYTHONPATH", ":".join([str(Path(__file__).parents[2]), *(p for p in sys.path if p)]))
+        cluster = Cluster(initialize_head=True, head_node_args=small)
+        try:
+            ray.init(address=cluster.address, log_to_driver=False)
+            cluster.second = cluster.add_node(**small)
+            cluster.wait_for_nodes()
+            yield cluster
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return fake_dataset(tmp_path_factory.mktemp("fake") / "set", 6)
+
+
+@pytest.fixture(scope="module")
+def reference(dataset, tmp_path_factory):
+    return outcomes(evaluate(dataset, tmp_path_factory.mktemp("r") / "log.jsonl", trials=TRIALS, batch=1))
+
+
+def no_policy():
+    raise FileNotFoundError("no such checkpoint")
+
+
+def run_on(
+    dataset, log, *, step_s=0.0, obs_type="state", slots=0, on_row=lambda engine: None, make_host=PushHost,
+    engine_options=None, **options,
+):  # fmt: skip
+    """Rows, and how many trials were begun again; `on_row` gets the engine."""
+    from lerobot_roborecover.trials.ray_engine import open_ray_engine
+
+    scenarios, run = open_run(
+        RecoveryOptions(scenarios=str(dataset), trial_log=str(log), **options),
+        PlatformPart(SlotConfig("fake", {"step_s": step_s, "obs_type": obs_type}), {}, None),
+        workers=True,
+        facts=RunFacts(policy="push", n_episodes=TRIALS),
+    )
+    run.protocol = replace(run.protocol, run_seed=1000)
+    run.pool.acquire()
+    try:
+        engine = open_ray_engine(
+            run, make_host, address="auto", slots=slots, replicas=1, gpus=0.0,
+            on_row=lambda row: on_row(engine), **(engine_options or {}),
+        )  # fmt: skip
+        engine.run(units_of(list(scenarios), TRIALS))
+    finally:
+        run.pool.release()
+    return read_trial_log(log), engine.reruns
+
+
+def test_two_nodes_give_the_same_rows(cluster, dataset, reference, tmp_path):
+    rows, reruns = run_on(dataset, tmp_path / "log.jsonl")
+    assert outcomes(rows) == reference
+    assert reruns == 0
+    assert {r.noise for r in rows} == {"per_trial"}
+    with pytest.raises(OptionError, match=r"9 simulators and 1 .* need 10 CPUs; .* has 4.*slots=3"):
+        run_on(dataset, tmp_path / "more.jsonl", slots=9)
+
+
+def test_a_policy_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
+    cluster, dataset, reference, tmp_path
+):
+    done = Counter()
+
+    def kill_once(engine):
+        done["rows"] += 1
+        if done["rows"] == 5:
+            import ray
+
+            ray.kill(engine._replicas[0]._actor)
+
+    rows, reruns = run_on(dataset, tmp_path / "log.jsonl", step_s=0.005, on_row=kill_once)
+    assert outcomes(rows) == reference
+    assert 1 <= reruns <= 3, "as many as there are simulators"
+
+
+def test_a_simulator_that_cannot_draw_ends_the_run_before_its_first_trial(cluster, dataset, tmp_path):
+    """Every simulator makes a picture on its own node first."""
+    from lerobot_roborecover.datasets import load_scenarios
+    from lerobot_roborecover.platforms import SimulatorError
+
+    smoke = load_scenarios(str(dataset))[0]
+    with pytest.raises(SimulatorError, match=r"first simulator on node [0-9.]+ failed: .*render_device=99"):
+        run_on(dataset, tmp_path / "a.jsonl", engine_options={"smoke": smoke, "render_device": "99"})
+    with pytest.raises(SimulatorError, match=r"first simulator on node [0-9.]+ failed: .*'smell'"):
+        run_on(dataset, tmp_path / "b.jsonl", obs_type="smell")
+    assert read_trial_log(tmp_path / "a.jsonl") == read_trial_log(tmp_path / "b.jsonl") == []
+
+
+def test_a_policy_that_cannot_be_loaded_ends_the_run(cluster, dataset, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such checkpoint"):
+        run_on(dataset, tmp_path / "a.jsonl", make_host=no_policy)
+
+
+@pytest.mark.lerobot
+@pytest.mark.nightly
+def test_the_command_on_a_cluster(cluster, dataset, tmp_path, monkeypatch):
+    """The user's own command, with a LeRobot checkpoint loaded on whichever node holds the policy."""
+    from lerobot_roborecover.cli.main import main
+
+    policy = save_policy(tmp_path / "policy", "diffusion")
+    arguments = [
+        "--env", "roborecover_fake", f"--env.scenarios={dataset}", f"--policy.path={policy}",
+        "--policy.device=cpu", "--eval.n_episodes=1",
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["roborecover"])
+    assert main(["eval", *arguments, "--engine=ray", f"--output_dir={tmp_path / 'ray'}"]) == 0
+    assert main(["eval", *arguments, f"--output_dir={tmp_path / 'local'}"]) == 0
+    rows = [read_trial_log(tmp_path / name / "trials.jsonl") for name in ("ray", "local")]
+    assert outcomes(rows[0]) == outcomes(rows[1])
+    assert len({r.actions_sha256 for r in rows[0]}) == len(rows[0]) == 6
+
+
+def test_a_node_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
+    cluster, dataset, reference, tmp_path
+):
+    """Whatever was on the node: two simulators, or the policy and one."""
+    log = tmp_path / "log.jsonl"
+    done = Counter()
+
+    def kill_in_the_middle(engine):
+        done["rows"] += 1
+        if done["rows"] == 5:
+            cluster.remove_node(cluster.second, allow_graceful=False)
+
+    rows, reruns = run_on(dataset, log, step_s=0.005, on_row=kill_in_the_middle)
+    assert done["rows"] == len(rows) == len(reference)
+    assert outcomes(rows) == reference
+    assert 1 <= reruns <= 3, "as many as there are simulators"
