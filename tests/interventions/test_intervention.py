@@ -15,6 +15,7 @@ from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, open_run
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.env.vector_env import create_recovery_envs
+from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.local import LocalEngine
 from lerobot_roborecover.workers.messages import SlotConfig
@@ -147,26 +148,32 @@ def test_a_person_at_the_page_takes_over_under_both_evaluators(
     made, taker = composite(checkpoints, "human"), Takeover(0)
     made[0].director._driver = taker
 
-    def person() -> None:
-        with Client(taker.address) as client:
-            while True:
-                try:
-                    client.ask("status")
-                    if client.status.get("step", 0) >= 3:
-                        client.ask("hand_back")
-                    else:
-                        client.hold([1.0, 0, 0, 0, 0, 0])
-                except TeleopRefusal:  # between two trials
-                    continue
+    def person(client: Client) -> None:
+        while not over.is_set():
+            try:
+                client.ask("status")
+                if client.status.get("step", 0) >= 3:
+                    client.ask("hand_back")
+                else:
+                    client.hold([1.0, 0, 0, 0, 0, 0])
+            except TeleopRefusal:  # between two trials
+                continue
+            except ScenarioError:
+                assert over.is_set(), "the page's connection broke during a trial"
 
-    threading.Thread(target=person, daemon=True).start()
-    for rows in (
-        stock_rows(dataset, tmp_path / "stock.jsonl", made, "human"),
-        engine_rows(dataset, tmp_path / "fast.jsonl", made, "human", slots=1),
-    ):
-        assert all(r.reason == "" for r in rows)
-        steps = [e["steps"] for r in rows for e in r.interventions if e["kind"] == "takeover"]
-        assert max(steps) >= 3, "some takeovers end by hand and not with their trial"
+    over = threading.Event()
+    with Client(taker.address) as client:
+        driving = threading.Thread(target=person, args=(client,), daemon=True)
+        driving.start()
+        for rows in (
+            stock_rows(dataset, tmp_path / "stock.jsonl", made, "human"),
+            engine_rows(dataset, tmp_path / "fast.jsonl", made, "human", slots=1),
+        ):
+            assert all(r.reason == "" for r in rows)
+            steps = [e["steps"] for r in rows for e in r.interventions if e["kind"] == "takeover"]
+            assert max(steps) >= 3, "some takeovers end by hand and not with their trial"
+        over.set()
+    driving.join()
 
 
 def test_a_trigger_never_reaches_another_slot(dataset, checkpoints, monitor, tmp_path):

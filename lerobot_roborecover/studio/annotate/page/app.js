@@ -254,8 +254,9 @@ async function open(id) {
   if (!after) return;
   const coming = await get(`api/episodes/${encodeURIComponent(after.id)}`).catch(() => null);
   if (!coming || mine !== opening) return;
-  following = new Frames(coming, session);
-  following.load(0);
+  const ahead = (following = new Frames(coming, session));
+  await ahead.load(0);
+  if (following === ahead) document.body.dataset.ahead = coming.id;
 }
 
 function step(by) {
