@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from lerobot_roborecover.scenario import ScenarioError
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[Path]:
+def new_file(path: Path) -> Generator[Path]:
     """A name beside `path`; what the block writes there takes its place when the block ends well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -54,7 +54,7 @@ def check_new(root: Path) -> None:
 
 
 @contextmanager
-def new_folder(root: Path, *, replace: bool = False) -> Iterator[Path]:
+def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     """A name beside `root`, not made yet, whose folder takes root's place when the block ends well.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +96,7 @@ def report(
 
 
 @contextmanager
-def _no_garbage_yet() -> Iterator[None]:
+def _no_garbage_yet() -> Generator[None]:
     """What is there now stays to the end: looking for garbage among millions of values takes long.
 
     Afterwards the collector looks at everything again, since a report may be one of many in a process; what

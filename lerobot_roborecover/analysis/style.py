@@ -7,7 +7,7 @@ cannot be read. The SVG files carry a second set of colours for readers whose sc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -114,7 +114,7 @@ def both(draw: Callable[[Width], Any]) -> tuple[Any, Any]:
 
 
 @contextmanager
-def drawing() -> Iterator[Any]:
+def drawing() -> Generator[Any]:
     """matplotlib's `subplots` under the report's style, without a display."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -223,7 +223,7 @@ def _check_counts(path: Path, manifest: Mapping[str, Any], scenarios: list[Scena
 
 
 @contextmanager
-def _at(where: str) -> Iterator[None]:
+def _at(where: str) -> Generator[None]:
     """Puts where it happened before the message of a refusal."""
     try:
         yield

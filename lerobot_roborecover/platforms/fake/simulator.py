@@ -12,7 +12,7 @@ import fcntl
 import hashlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -117,7 +117,7 @@ class FakeSimulator:
         self._state = np.concatenate([position, velocity, puck])
 
     @contextmanager
-    def _core(self) -> Iterator[None]:
+    def _core(self) -> Generator[None]:
         """Holds one of the cores, where there is a limit."""
         mine = None
         while self._locks and mine is None:

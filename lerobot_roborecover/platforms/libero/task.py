@@ -12,7 +12,7 @@ What is not obvious about robosuite and LIBERO, and is handled here:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -352,7 +352,7 @@ _UNSTABLE = (
 
 
 @contextmanager
-def _numpy_random(seed: int | None) -> Iterator[None]:
+def _numpy_random(seed: int | None) -> Generator[None]:
     """numpy's global generator, which LIBERO draws from, seeded inside and as it was outside."""
     state = np.random.get_state()
     if seed is not None:

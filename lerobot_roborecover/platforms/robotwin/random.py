@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import random
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import numpy as np
 
@@ -21,7 +21,7 @@ class RandomStreams:
         self._state: tuple | None = None
 
     @contextlib.contextmanager
-    def fresh(self, seed: int) -> Iterator[None]:
+    def fresh(self, seed: int) -> Generator[None]:
         """A stream that starts from a seed (RoboTwin leaves Python's `random` unseeded)."""
         self._state = None
         with self.own():
@@ -29,7 +29,7 @@ class RandomStreams:
             yield
 
     @contextlib.contextmanager
-    def own(self) -> Iterator[None]:
+    def own(self) -> Generator[None]:
         """The task's stream within, the caller's again after."""
         callers = self._get()
         if self._state is not None:

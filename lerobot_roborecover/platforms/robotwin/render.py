@@ -11,7 +11,7 @@ unconditionally. Both are answered here for the duration of a reset, without tou
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
@@ -40,7 +40,7 @@ _NO_DEVICE = (
 
 
 @contextlib.contextmanager
-def rendering(quality: str) -> Iterator[None]:
+def rendering(quality: str) -> Generator[None]:
     """Scenes made within are rendered with `quality`.
 
     Raises:
@@ -88,7 +88,7 @@ def rendering(quality: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def no_rendering() -> Iterator[None]:
+def no_rendering() -> Generator[None]:
     """Scenes made within have physics alone and need no Vulkan device."""
     import sapien
     import sapien.core
@@ -158,7 +158,7 @@ def _ignore(*_: Any, **__: Any) -> None:
 
 
 @contextlib.contextmanager
-def _replaced(attributes: list[tuple[Any, str, Any]]) -> Iterator[None]:
+def _replaced(attributes: list[tuple[Any, str, Any]]) -> Generator[None]:
     with contextlib.ExitStack() as stack:
         for owner, name, value in attributes:
             stack.callback(setattr, owner, name, getattr(owner, name))

@@ -7,7 +7,7 @@ import importlib
 import io
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from copy import deepcopy
 from typing import Any
 
@@ -126,7 +126,7 @@ def without_objects(checkout: RobotwinCheckout) -> list[str]:
 
 
 @contextlib.contextmanager
-def working_in(root: os.PathLike[str]) -> Iterator[None]:
+def working_in(root: os.PathLike[str]) -> Generator[None]:
     """Another working directory within: RoboTwin's code opens its files relative to the checkout."""
     before = os.getcwd()
     os.chdir(root)
@@ -137,7 +137,7 @@ def working_in(root: os.PathLike[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def quiet() -> Generator[None]:
     """Swallows RoboTwin's progress output, one line an action."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield

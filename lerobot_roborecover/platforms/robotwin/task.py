@@ -19,7 +19,7 @@ import contextlib
 import hashlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any
 
 import numpy as np
@@ -221,7 +221,7 @@ def _pose(values: Any) -> Pose:
 
 
 @contextlib.contextmanager
-def _gradients() -> Iterator[None]:
+def _gradients() -> Generator[None]:
     """curobo optimises with torch's gradients, which an evaluation loop switches off around us."""
     torch = sys.modules.get("torch")
     with torch.enable_grad() if torch is not None else contextlib.nullcontext():

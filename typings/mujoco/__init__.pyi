@@ -1,0 +1,166 @@
+"""What this package uses of MuJoCo 3.3's compiled bindings, whose wheel has no type information of its own.
+
+Arrays are views into the C structures: the shapes are those of MuJoCo's reference (mjModel, mjData).
+"""
+
+from enum import IntEnum
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__version__: str
+
+class mjtGeom(IntEnum):
+    mjGEOM_SPHERE = ...
+    mjGEOM_CYLINDER = ...
+    mjGEOM_BOX = ...
+    mjGEOM_MESH = ...
+
+class mjtObj(IntEnum):
+    mjOBJ_CAMERA = ...
+
+class mjtRndFlag(IntEnum):
+    mjRND_SHADOW = ...
+    mjRND_REFLECTION = ...
+
+class mjtStage(IntEnum):
+    mjSTAGE_VEL = ...
+
+class mjtState(IntEnum):
+    mjSTATE_INTEGRATION = ...
+
+class mjtWarning(IntEnum):
+    mjWARN_BADQPOS = ...
+    mjWARN_BADQVEL = ...
+    mjWARN_BADQACC = ...
+
+class _Named:
+    """What `MjModel.body` and its like give: the fields of one of the model's things."""
+
+    id: int
+    name: str
+
+class _BodyState:
+    """What `MjData.body` gives."""
+
+    xpos: np.ndarray
+    xquat: np.ndarray
+
+class _Quality:
+    shadowsize: int
+    offsamples: int
+
+class _Global:
+    offwidth: int
+    offheight: int
+
+class _Visual:
+    quality: _Quality
+    global_: _Global
+
+class MjModel:
+    nbody: int
+    ncam: int
+    ngeom: int
+    nmesh: int
+    nv: int
+    body_jntnum: np.ndarray
+    body_parentid: np.ndarray
+    body_pos: np.ndarray
+    body_quat: np.ndarray
+    cam_pos: np.ndarray
+    geom_bodyid: np.ndarray
+    geom_contype: np.ndarray
+    geom_dataid: np.ndarray
+    geom_matid: np.ndarray
+    geom_size: np.ndarray
+    geom_type: np.ndarray
+    jnt_dofadr: np.ndarray
+    jnt_limited: np.ndarray
+    jnt_qposadr: np.ndarray
+    jnt_range: np.ndarray
+    mat_texid: np.ndarray
+    mesh_face: np.ndarray
+    mesh_faceadr: np.ndarray
+    mesh_facenormal: np.ndarray
+    mesh_facenum: np.ndarray
+    mesh_facetexcoord: np.ndarray
+    mesh_vert: np.ndarray
+    mesh_vertadr: np.ndarray
+    mesh_vertnum: np.ndarray
+    site_pos: np.ndarray
+    site_rgba: np.ndarray
+    vis: _Visual
+    @staticmethod
+    def from_xml_string(xml: str) -> MjModel: ...
+    def body(self, which: int | str) -> _Named: ...
+    def camera(self, which: int | str) -> _Named: ...
+
+class _Contacts:
+    geom: np.ndarray
+
+class _Warning:
+    number: int
+
+class MjData:
+    contact: _Contacts
+    mocap_pos: np.ndarray
+    qacc_warmstart: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    geom_xmat: np.ndarray
+    geom_xpos: np.ndarray
+    site_xmat: np.ndarray
+    site_xpos: np.ndarray
+    warning: list[_Warning]
+    xipos: np.ndarray
+    xmat: np.ndarray
+    xpos: np.ndarray
+    xquat: np.ndarray
+    def __init__(self, model: MjModel) -> None: ...
+    def body(self, which: int | str) -> _BodyState: ...
+
+class MjvOption:
+    geomgroup: np.ndarray
+
+class MjvScene:
+    flags: np.ndarray
+
+class Renderer:
+    model: MjModel
+    scene: MjvScene
+    def __init__(self, model: MjModel, height: int = ..., width: int = ...) -> None: ...
+    def update_scene(
+        self, data: MjData, camera: int | str = ..., scene_option: MjvOption | None = ...
+    ) -> None: ...
+    def render(self) -> np.ndarray: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> Renderer: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None: ...
+
+def mj_comPos(m: MjModel, d: MjData) -> None: ...
+def mj_forward(m: MjModel, d: MjData) -> None: ...
+def mj_forwardSkip(m: MjModel, d: MjData, skipstage: int, skipsensor: int) -> None: ...
+def mj_getState(m: MjModel, d: MjData, state: np.ndarray, spec: int) -> None: ...
+def mj_jacSite(m: MjModel, d: MjData, jacp: np.ndarray, jacr: np.ndarray, site: int) -> None: ...
+def mj_kinematics(m: MjModel, d: MjData) -> None: ...
+def mj_name2id(m: MjModel, type: int, name: str) -> int: ...
+def mj_ray(
+    m: MjModel,
+    d: MjData,
+    pnt: np.ndarray,
+    vec: np.ndarray,
+    geomgroup: np.ndarray | None,
+    flg_static: int,
+    bodyexclude: int,
+    geomid: np.ndarray,
+) -> float: ...
+def mj_resetData(m: MjModel, d: MjData) -> None: ...
+def mj_setState(m: MjModel, d: MjData, state: np.ndarray, spec: int) -> None: ...
+def mj_stateSize(m: MjModel, spec: int) -> int: ...
+def mj_step1(m: MjModel, d: MjData) -> None: ...
+def mj_step2(m: MjModel, d: MjData) -> None: ...
+def mju_mat2Quat(quat: np.ndarray, mat: ArrayLike) -> None: ...
