@@ -8,7 +8,6 @@ which a `roborecover serve` at the other end keeps the trial's history and noise
 from __future__ import annotations
 
 import logging
-import os
 import uuid
 import weakref
 from collections import deque
@@ -27,6 +26,7 @@ from torch import Tensor, nn
 from lerobot_roborecover.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.remote.connection import Request, Server, ServerOptions
 from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError
+from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
 from lerobot_roborecover.remote.sessions import ENVELOPE, PROTOCOL
 from lerobot_roborecover.remote.translate import Translator
@@ -69,7 +69,9 @@ class RemotePolicy(PreTrainedPolicy):
         # LeRobot asks a policy's parameters for its device.
         self._anchor = nn.Parameter(torch.zeros(1), requires_grad=False)
         mapping = load_mapping(config.mapping)
-        self.translator = Translator(mapping, config.n_action_steps)
+        feature = (config.output_features or {}).get(ACTION)
+        width = None if feature is None else int(feature.shape[0])
+        self.translator = Translator(mapping, config.n_action_steps, width)
         self.native = mapping.native
         self._reset_message = mapping.reset.message if mapping.reset else None
         self.server = Server(
@@ -80,7 +82,7 @@ class RemotePolicy(PreTrainedPolicy):
                 reconnect_s=config.reconnect_s,
                 connections=config.connections,
                 max_frame_bytes=config.max_frame_mb * 2**20,
-                api_key=os.environ.get("ROBORECOVER_API_KEY"),
+                api_key=api_key(),
                 greeting=self._reset_message,
             )
         )

@@ -7,6 +7,7 @@ Only arrays of booleans, integers and floats pass, in both directions: no object
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import msgpack
@@ -15,9 +16,15 @@ import numpy as np
 from lerobot_roborecover.remote.errors import WireError
 
 _KINDS = "biuf"
+_DTYPE = re.compile(r"[<>|=]?([biu][1248]|f[248])|bool|u?int(8|16|32|64)|float(16|32|64)")
+"""What numpy is asked to read: its own parser of dtypes takes whole structures, and raises what it likes."""
 _MAX_DIMENSIONS = 16
-_LONGEST = 100_000
-"""Values of a list or map: bytes of a frame may become fifty times as many in memory."""
+_LONGEST = 4096
+"""Values of one list or map, whose room is made before they have been read."""
+_MOST_VALUES = 65_536
+"""Values of all lists and maps of a frame: a byte on the wire may be sixty in memory. An array is one."""
+_LONGEST_TEXT = 2**20
+"""Characters of a text: one that is not ASCII makes every one of them four bytes."""
 
 
 def pack(message: Any) -> bytes:
@@ -40,13 +47,31 @@ def unpack(data: bytes, what: str = "message") -> Any:
         what: who sent it, for the error.
 
     Raises:
-        WireError: the bytes are no msgpack, or hold an array that is not allowed or lies about its size.
+        WireError: the bytes are no msgpack, or hold an array that is not allowed or lies about its size, or
+            more values than any request has.
     """
+    left = _MOST_VALUES
+
+    def count(values: int) -> None:
+        nonlocal left
+        left -= values
+        if left < 0:
+            raise ValueError(f"more than {_MOST_VALUES} values in lists and maps; send numbers as arrays")
+
+    def map_read(content: dict) -> Any:
+        count(2 * len(content) + 1)
+        return _decode(content)
+
+    def list_read(content: list) -> list:
+        count(len(content) + 1)
+        return content
+
     try:
         return msgpack.unpackb(
-            data, object_hook=_decode, max_array_len=_LONGEST, max_map_len=_LONGEST, max_ext_len=0
-        )
-    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as err:
+            data, object_hook=map_read, list_hook=list_read, max_array_len=_LONGEST, max_map_len=_LONGEST,
+            max_str_len=_LONGEST_TEXT, max_ext_len=0,
+        )  # fmt: skip
+    except Exception as err:  # whatever a stranger's bytes make of it, it is their fault and no reason to end
         reason = str(err) or type(err).__name__
         raise WireError(f"{what}: {len(data)} bytes that are not openpi's msgpack: {reason}") from err
 
@@ -76,8 +101,8 @@ def _decode(value: dict) -> Any:
 
 def _dtype(value: dict) -> np.dtype:
     name = value.get(b"dtype")
-    dtype = np.dtype(name) if isinstance(name, str) else None
-    if dtype is None or dtype.kind not in _KINDS or dtype.hasobject:
+    dtype = np.dtype(name) if isinstance(name, str) and _DTYPE.fullmatch(name) else None
+    if dtype is None or dtype.kind not in _KINDS:
         raise ValueError(f"array of dtype {name!r:.60}; only booleans, integers and floats are taken")
     return dtype
 

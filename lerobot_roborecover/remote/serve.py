@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,8 +15,9 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.remote.keys import API_KEY, api_key
 from lerobot_roborecover.remote.served import ServedPolicy
-from lerobot_roborecover.remote.server import PolicyServer, ServeOptions
+from lerobot_roborecover.remote.server import PolicyServer, ServeOptions, is_loopback
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +28,7 @@ class ServeConfig:
 
     policy: PreTrainedConfig | None = None
     host: str = "127.0.0.1"
-    """Address to listen on. Anyone who reaches it can use the policy: keep to the loopback and an SSH tunnel,
-    or set ROBORECOVER_API_KEY on both sides."""
+    """Address to listen on. Beyond the loopback, ROBORECOVER_API_KEY must be set, here and at the client."""
     port: int = 8000
     max_batch: int = 64
     """Requests inferred together, at most."""
@@ -39,6 +38,12 @@ class ServeConfig:
     """Of a request."""
     max_sessions: int = 256
     """Trials whose history is kept at once."""
+    certfile: str = ""
+    """TLS certificate chain, PEM: clients then say wss:// (--certfile CERT --keyfile KEY)."""
+    keyfile: str = ""
+    """Its private key, PEM."""
+    insecure: bool = False
+    """Let everybody who reaches --host use the policy, without a key."""
     rename_map: dict[str, str] = field(default_factory=dict)
     """The client's observation keys to the policy's, as in `lerobot-eval`."""
 
@@ -66,6 +71,13 @@ class ServeConfig:
         ):
             if not low <= getattr(self, name) <= high:
                 raise OptionError(f"--{name}={getattr(self, name)}: must be from {low} to {high}")
+        if self.keyfile and not self.certfile:
+            raise OptionError(f"--keyfile={self.keyfile}: the key of which certificate? Give --certfile")
+        if api_key() is None and not is_loopback(self.host) and not self.insecure:
+            raise OptionError(
+                f"--host={self.host}: whoever reaches this address could use the policy. Set {API_KEY} here "
+                "and at the client; or listen on 127.0.0.1 and use an SSH tunnel; or say --insecure=true"
+            )
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -104,31 +116,35 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
     return ServedPolicy(policy, pre, post, rename_map, max_batch)
 
 
+def public_name(path: str) -> str:
+    """What clients are told of a checkpoint: a Hub id, or a folder's own name without where it lies.
+
+    Args:
+        path: of `--policy.path`.
+    """
+    return Path(path).resolve().name if Path(path).exists() else path
+
+
 @parser.wrap()
 def serve(cfg: ServeConfig) -> int:
     """Serves until it is interrupted; see `main`."""
     cfg.check()
     options = ServeOptions(
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
-        os.environ.get("ROBORECOVER_API_KEY"),
+        api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
     served = load_served(cfg.policy, cfg.rename_map, cfg.max_batch)
-    server = PolicyServer(served, str(cfg.policy.pretrained_path), options)
+    server = PolicyServer(served, public_name(str(cfg.policy.pretrained_path)), options)
     if cfg.policy.type == "xvla":
         logger.warning(
             "lerobot-eval gives X-VLA processors of its own on LIBERO, which a client does not know: its "
             "scores through a server are not those of --policy.path"
         )
 
-    if options.api_key is None and cfg.host not in ("127.0.0.1", "localhost", "::1"):
-        logger.warning(
-            "--host=%s: whoever reaches this address can use the policy. Set ROBORECOVER_API_KEY here and at "
-            "the client, or listen on 127.0.0.1 and use an SSH tunnel", cfg.host,
-        )  # fmt: skip
-
     def ready(port: int) -> None:
         host = f"[{cfg.host}]" if ":" in cfg.host else cfg.host
-        print(f"serving {cfg.policy.type} at ws://{host}:{port} (Ctrl-C ends)", flush=True)
+        scheme = "wss" if cfg.certfile else "ws"
+        print(f"serving {cfg.policy.type} at {scheme}://{host}:{port} (Ctrl-C ends)", flush=True)
 
     asyncio.run(server.run(ready))
     print(f"stopped after {server.served} inferences", flush=True)

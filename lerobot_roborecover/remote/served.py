@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,14 @@ class ServedPolicy(PolicyHost):
         }
         """Features of an observation, by the client's keys."""
         self.action_width = int(config.output_features["action"].shape[0])
+
+    def company(self, observation: Mapping[str, np.ndarray]) -> Hashable:
+        """What an observation must have in common with those that it is inferred with: keys and shapes.
+
+        Args:
+            observation: of `check`.
+        """
+        return tuple(sorted((key, array.shape, array.dtype.str) for key, array in observation.items()))
 
     def metadata(self, name: str) -> dict[str, Any]:
         """What a client learns when it connects.

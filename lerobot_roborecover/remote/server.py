@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import http
+import ipaddress
 import logging
 import secrets
 import signal
+import ssl
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -38,6 +40,42 @@ class ServeOptions:
     max_sessions: int = 256
     api_key: str | None = None
     """Clients must send it; None lets everybody in."""
+    certfile: str = ""
+    """TLS certificate chain, PEM; empty serves without TLS."""
+    keyfile: str = ""
+    """Its private key, PEM; empty where the certificate's file holds it."""
+
+    def tls(self) -> ssl.SSLContext | None:
+        """The server's side of TLS; None without.
+
+        Raises:
+            RemoteError: the files cannot be used.
+        """
+        if not self.certfile:
+            return None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        try:
+            context.load_cert_chain(self.certfile, self.keyfile or None)
+        except (OSError, ssl.SSLError) as err:
+            raise RemoteError(
+                f"--certfile={self.certfile} --keyfile={self.keyfile}: {err}. They are PEM files: the "
+                "certificate with its chain, and its private key without a passphrase"
+            ) from err
+        return context
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address to listen on.
+
+    Args:
+        host: a name or an IP address.
+    """
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 @dataclass
@@ -94,7 +132,15 @@ class Batcher:
             if batch:
                 await self._infer(batch)
 
-    async def _infer(self, batch: list[_Question]) -> None:
+    async def _infer(self, waiting: list[_Question]) -> None:
+        """Clients may look at different things: only what has the same keys and shapes is one batch."""
+        batches: dict[Any, list[_Question]] = {}
+        for question in waiting:
+            batches.setdefault(self._policy.company(question.observation), []).append(question)
+        for batch in batches.values():
+            await self._infer_together(batch)
+
+    async def _infer_together(self, batch: list[_Question]) -> None:
         try:
             columns = zip(*((q.observation, q.instruction, q.history) for q in batch), strict=True)
             answers = await self.call(self._policy.act, *map(list, columns))
@@ -136,7 +182,7 @@ class PolicyServer:
         Raises:
             RemoteError: the address cannot be used.
         """
-        options = self._options
+        options, tls = self._options, self._options.tls()
         self._batcher = Batcher(self._policy, options.batch_delay_s, lambda: self._connections)
 
         async def start(seed: int | None) -> Any:
@@ -156,7 +202,7 @@ class PolicyServer:
             async with serve(
                 self._handle, options.host, options.port, compression=None, ping_interval=30, ping_timeout=60,
                 max_size=options.max_frame_bytes, max_queue=4, process_request=self._admit,
-                server_header=None, close_timeout=2,
+                server_header=None, close_timeout=2, ssl=tls,
             ) as server:  # fmt: skip
                 ready(server.sockets[0].getsockname()[1])
                 await stop.wait()
@@ -170,12 +216,26 @@ class PolicyServer:
             self._batcher.close()
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        refusal = self._refusal(request)
+        if refusal is not None:
+            return connection.respond(*refusal)
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        key = self._options.api_key
-        given = request.headers.get("Authorization", "")
-        if key and not secrets.compare_digest(given.encode(), f"Api-Key {key}".encode()):
+        key, given = self._options.api_key, request.headers.get_all("Authorization")
+        if key is not None and not (
+            len(given) == 1 and secrets.compare_digest(given[0].encode(), f"Api-Key {key}".encode())
+        ):
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "wrong or missing API key\n")
+        return None
+
+    def _refusal(self, request: Request) -> tuple[http.HTTPStatus, str] | None:
+        """Pages that a browser has open reach the loopback, too: they say where they come from, or call us by
+        a name of their own."""
+        if request.headers.get_all("Origin"):
+            return http.HTTPStatus.FORBIDDEN, "a policy server takes no requests from web pages\n"
+        hosts = request.headers.get_all("Host")
+        if is_loopback(self._options.host) and not (len(hosts) == 1 and is_loopback(_bare(hosts[0]))):
+            return http.HTTPStatus.FORBIDDEN, "this policy server is called localhost\n"
         return None
 
     async def _handle(self, socket: ServerConnection) -> None:
@@ -197,7 +257,8 @@ class PolicyServer:
         try:
             if isinstance(message, str):
                 raise RequestError("a text frame; requests are binary frames of msgpack")
-            content = unpack(message, "the request")
+            # Not in the event loop: a large frame would keep everybody else waiting.
+            content = await asyncio.to_thread(unpack, message, "the request")
             if not isinstance(content, dict):
                 raise RequestError(f"a request is a map, not a {type(content).__name__}")
             envelope = read_envelope(content, own)
@@ -241,6 +302,13 @@ class PolicyServer:
         if envelope.end:
             await self._sessions.end(envelope.session)
         return session.last
+
+
+def _bare(host: str) -> str:
+    """The host of a `Host` header, without its port."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0]
 
 
 def _stop_on_signals(stop: asyncio.Event) -> None:

@@ -21,10 +21,12 @@ class Translator:
     Args:
         mapping: checked.
         execute: actions executed per request; None leaves it to the mapping.
+        width: values in an action of the environment; None where it is not known.
     """
 
-    def __init__(self, mapping: Mapping, execute: int | None = None):
+    def __init__(self, mapping: Mapping, execute: int | None = None, width: int | None = None):
         self.mapping = mapping
+        self._width = width
         self.execute = execute or mapping.actions.execute
 
     @property
@@ -81,6 +83,11 @@ class Translator:
                     f"{list(rule.columns)}"
                 )
             chunk = chunk[:, rule.columns]
+        if self._width is not None and chunk.shape[1] != self._width:
+            raise WireError(
+                f"the server gave actions of width {chunk.shape[1]}; the environment takes {self._width}. It "
+                "was trained for another platform or action mode, or the mapping lacks 'columns'"
+            )
         chunk = chunk.astype(np.float32 if chunk.dtype.itemsize <= 4 else np.float64)
         for values, apply in ((rule.scale, np.multiply), (rule.offset, np.add)):
             if values is not None:

@@ -10,6 +10,7 @@ Loads the policy as scripts/eval/eval-libero.sh of BeingBeyond/Being-H does at 5
 from __future__ import annotations
 
 import argparse
+import os
 
 import numpy as np
 from policy_server import serve
@@ -46,4 +47,4 @@ if __name__ == "__main__":
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8000)
     args = parser.parse_args()
-    serve(load(args.model_path), {"policy": args.model_path}, args.host, args.port)
+    serve(load(args.model_path), {"policy": os.path.basename(args.model_path)}, args.host, args.port)

@@ -61,4 +61,6 @@ if __name__ == "__main__":
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8000)
     args = parser.parse_args()
-    serve(load(args.checkpoint, args.seed), {"policy": args.checkpoint}, args.host, args.port)
+    serve(
+        load(args.checkpoint, args.seed), {"policy": os.path.basename(args.checkpoint)}, args.host, args.port
+    )

@@ -6,7 +6,10 @@ For policies that cannot live in one environment with LeRobot: run it, with a fe
 
 from __future__ import annotations
 
+import hmac
 import http
+import os
+import re
 import threading
 import time
 import traceback
@@ -17,6 +20,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve as listen
 
 KINDS = "biuf"
+DTYPE = re.compile(r"[<>|=]?([biu][1248]|f[248])|bool|u?int(8|16|32|64)|float(16|32|64)")
+API_KEY = "ROBORECOVER_API_KEY"
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+LIMITS = {"max_array_len": 4096, "max_map_len": 4096, "max_str_len": 2**20, "max_ext_len": 0}
 
 
 def encode(value):
@@ -36,42 +43,64 @@ def decode(value):
     """msgpack's `object_hook`: arrays of numbers, never of objects."""
     if b"__ndarray__" not in value and b"__npgeneric__" not in value:
         return value
+    if not DTYPE.fullmatch(str(value[b"dtype"])):
+        raise ValueError(f"arrays of dtype {value[b'dtype']!r:.60} are not taken")
     dtype = np.dtype(value[b"dtype"])
-    if dtype.kind not in KINDS:
-        raise ValueError(f"arrays of dtype {dtype} are not taken")
     if b"__npgeneric__" in value:
         return dtype.type(value[b"data"])
     return np.frombuffer(value[b"data"], dtype).reshape(value[b"shape"]).copy()
 
 
-def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, started=None):
+def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, started=None, insecure=False):
     """Serves for ever.
+
+    Where the environment variable ROBORECOVER_API_KEY is set, clients must send it (RoboRecover's do, where it
+    is set for them; openpi's have `api_key`). Browsers are refused.
 
     Args:
         infer: called with a request, a dict; returns a dict, with `actions` an (n, A) array. One at a time.
         metadata: sent to every client that connects.
-        host: address to listen on. Whoever reaches it can use the policy.
+        host: address to listen on; beyond the loopback a key is needed.
         port: 0 takes a free one.
         max_frame_mb: of a request.
         started: called with the server, if given.
+        insecure: listen beyond the loopback without a key.
     """
     one_at_a_time = threading.Lock()
+    key = os.environ.get(API_KEY)
+    if key is not None and not key.strip():
+        raise SystemExit(f"{API_KEY} is set and empty: give it a value, or unset it")
+    if key is None and host not in LOOPBACK and not insecure:
+        raise SystemExit(
+            f"host {host}: whoever reaches this address could use the policy. Set {API_KEY} here and at the "
+            "client, or listen on 127.0.0.1 and use an SSH tunnel, or call serve(..., insecure=True)"
+        )
 
-    def health(connection, request):
-        return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
+    def admit(connection, request):
+        if request.headers.get_all("Origin"):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "no requests from web pages\n")
+        if request.path == "/healthz":
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
+        given = request.headers.get_all("Authorization")
+        if key is not None and not (
+            len(given) == 1 and hmac.compare_digest(given[0].encode(), f"Api-Key {key}".encode())
+        ):
+            return connection.respond(http.HTTPStatus.UNAUTHORIZED, "wrong or missing API key\n")
+        return None
 
     def answer(message):
         try:
             if isinstance(message, str):
                 raise ValueError("a text frame; requests are binary")
-            request = msgpack.unpackb(message, object_hook=decode)
+            request = msgpack.unpackb(message, object_hook=decode, **LIMITS)
             with one_at_a_time:
                 began = time.monotonic()
                 result = dict(infer(request))
             result["server_timing"] = {"infer_ms": 1000 * (time.monotonic() - began)}
             return msgpack.packb(result, default=encode)
-        except Exception:  # an error belongs to its request
-            return traceback.format_exc()
+        except Exception as error:  # an error belongs to its request; where it was is for this side to read
+            traceback.print_exc()
+            return f"{type(error).__name__}: {error}"
 
     def handle(connection):
         try:
@@ -82,7 +111,7 @@ def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, st
             pass
 
     size = max_frame_mb * 2**20
-    with listen(handle, host, port, compression=None, max_size=size, process_request=health) as server:
+    with listen(handle, host, port, compression=None, max_size=size, process_request=admit) as server:
         print(f"serving at ws://{host}:{server.socket.getsockname()[1]}", flush=True)
         if started is not None:
             started(server)

@@ -13,6 +13,7 @@ are chosen by the word "libero" on the command line: keep this file's name.
 from __future__ import annotations
 
 import argparse
+import os
 
 import numpy as np
 from policy_server import serve
@@ -78,4 +79,4 @@ if __name__ == "__main__":
     parser.add_argument("--port", type=int, default=8000)
     args = parser.parse_args()
     infer = load(args.pretrained_path, args.vlm_pretrained_path)
-    serve(infer, {"policy": args.pretrained_path}, args.host, args.port)
+    serve(infer, {"policy": os.path.basename(args.pretrained_path)}, args.host, args.port)

@@ -267,12 +267,36 @@ def test_the_standalone_server_speaks_to_both_clients(standalone, openpi_client)
     theirs = WebsocketClientPolicy(url)
     assert theirs.get_server_metadata() == {"policy": "p"}
     np.testing.assert_array_equal(theirs.infer({"state": np.ones(3)})["actions"], [[2, 2, 2]])
-    with pytest.raises(RuntimeError, match="KeyError"):
+    with pytest.raises(RuntimeError, match="KeyError") as refused:
         theirs.infer({"stat": 1})
+    assert "Traceback (most recent call last)" not in str(refused.value)
     good, bad, objects = ask(url, {"state": np.ones(3)}, {"stat": 1}, {"state": b"\x80"})
     np.testing.assert_array_equal(good["actions"], [[2, 2, 2]])
     assert "KeyError: 'state'" in str(bad)
     assert isinstance(objects, ServerRefusedError)
+
+
+def test_the_standalone_server_keeps_strangers_out(standalone, openpi_client, monkeypatch):  # noqa: F811
+    import websockets.sync.client
+    from openpi_client.websocket_client_policy import WebsocketClientPolicy
+
+    monkeypatch.setenv("ROBORECOVER_API_KEY", "secret")
+    url = standalone(lambda request: {"actions": request["state"][None]})
+    for headers in ({}, {"Authorization": "Api-Key x"}, {"Origin": "https://example.org"}):
+        with pytest.raises(websockets.exceptions.InvalidStatus):
+            websockets.sync.client.connect(url, additional_headers=headers)
+    np.testing.assert_array_equal(
+        ask(url, {"state": np.ones(3)}, api_key="secret")[0]["actions"], [[1, 1, 1]]
+    )
+    theirs = WebsocketClientPolicy(url, api_key="secret")
+    np.testing.assert_array_equal(theirs.infer({"state": np.ones(3)})["actions"], [[1, 1, 1]])
+    module = importlib.import_module("policy_server")
+    monkeypatch.setenv("ROBORECOVER_API_KEY", "")
+    with pytest.raises(SystemExit, match="set and empty"):
+        module.serve(lambda request: {})
+    monkeypatch.delenv("ROBORECOVER_API_KEY")
+    with pytest.raises(SystemExit, match="could use the policy"):
+        module.serve(lambda request: {}, host="0.0.0.0")
 
 
 def modules(monkeypatch, **names):

@@ -1,0 +1,28 @@
+"""The secret that a policy server and its clients share; imports nothing heavy."""
+
+from __future__ import annotations
+
+import os
+
+from lerobot_roborecover.remote.errors import RemoteError
+
+API_KEY = "ROBORECOVER_API_KEY"
+"""Environment variable, on both machines."""
+
+
+def api_key() -> str | None:
+    """The key of this process; None where none is set.
+
+    Raises:
+        RemoteError: it is set, and is empty or nothing that a header can carry.
+    """
+    key = os.environ.get(API_KEY)
+    if key is None:
+        return None
+    if not key.strip():
+        raise RemoteError(
+            f"{API_KEY} is set and empty, which would let everybody in: give it a value, or unset it"
+        )
+    if key != key.strip() or not key.isascii() or not key.isprintable():
+        raise RemoteError(f"{API_KEY} holds spaces at its ends, or what is not printable ASCII")
+    return key
