@@ -54,8 +54,8 @@ def decode(value):
 def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, started=None, insecure=False):
     """Serves for ever.
 
-    Where the environment variable ROBORECOVER_API_KEY is set, clients must send it (RoboRecover's do, where it
-    is set for them; openpi's have `api_key`). Browsers are refused.
+    Where the environment variable ROBORECOVER_API_KEY is set, clients must send it (RoboRecover's do, where
+    it is set for them; openpi's have `api_key`). Browsers are refused.
 
     Args:
         infer: called with a request, a dict; returns a dict, with `actions` an (n, A) array. One at a time.

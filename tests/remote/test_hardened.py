@@ -1,4 +1,4 @@
-"""What a policy server that faces a network must stand: strangers, web pages, bad frames, clients that differ."""
+"""What a policy server that faces a network must stand: strangers, web pages, bad frames, other cameras."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ def test_web_pages_and_other_names_are_refused_on_the_loopback():
         assert status(url, Origin="https://example.org") == 403
         assert status(url, Origin="null") == 403
         # A page whose name was made to resolve to 127.0.0.1 says that name.
+        host, port = url.removeprefix("ws://").split(":")
         with pytest.raises(InvalidStatus) as refused:
-            host, port = url.removeprefix("ws://").split(":")
             websockets.sync.client.connect(f"ws://rebound.example:{port}", sock=_socket(host, int(port)))
         assert refused.value.response.status_code == 403
 
