@@ -21,6 +21,8 @@ from lerobot_roborecover.platforms.simulator import Observation, Simulator, Simu
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task, TrialStart
 
 if TYPE_CHECKING:
+    from lerobot.envs.configs import EnvConfig
+
     from lerobot_roborecover.platforms.controls import Controls
     from lerobot_roborecover.platforms.findings import Check
     from lerobot_roborecover.platforms.starts import Starts
@@ -59,6 +61,13 @@ class SimulatorSetup:
     """How actions after the handoff are read, for simulators that have more than one way."""
     approximate_snapshots: bool = False
     """Use snapshots also where what follows them drifts from a replay."""
+
+
+class Filmed:
+    """A platform's env config, as far as recovery evaluation decides it where the env type is registered."""
+
+    videos: bool
+    """Render frames for LeRobot's videos also where the observation has no pixels (`RecoveryOptions`)."""
 
 
 class Platform:
@@ -375,7 +384,7 @@ class Platform:
         return f"<platform {self.name}>"
 
 
-def refuse_unused(config: object, base: type, names: tuple[str, ...]) -> None:
+def refuse_unused(config: EnvConfig, base: type[EnvConfig], names: tuple[str, ...]) -> None:
     """Refuses options that LeRobot's own env has and a scenario settles by itself.
 
     Args:

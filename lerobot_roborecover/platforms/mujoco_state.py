@@ -53,7 +53,7 @@ def hash_arrays(*arrays: np.ndarray) -> str:
 def pack_arrays(**arrays: np.ndarray) -> bytes:
     """Named arrays as one npz file in memory."""
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # ty: ignore[invalid-argument-type] - no array is named `allow_pickle`
     return buffer.getvalue()
 
 

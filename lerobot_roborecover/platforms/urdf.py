@@ -115,12 +115,19 @@ def _joint(element: ElementTree.Element) -> Joint:
     return Joint(
         name=element.attrib["name"],
         kind=element.attrib["type"],
-        parent=element.find("parent").attrib["link"],
-        child=element.find("child").attrib["link"],
+        parent=_link(element, "parent"),
+        child=_link(element, "child"),
         origin=pose,
         axis=direction / max(float(np.linalg.norm(direction)), 1e-12),
         limits=limits,
     )
+
+
+def _link(joint: ElementTree.Element, which: str) -> str:
+    found = joint.find(which)
+    if found is None:
+        raise ValueError(f"joint {joint.get('name')!r} has no {which}")
+    return found.attrib["link"]
 
 
 def _numbers(text: str) -> np.ndarray:

@@ -10,6 +10,7 @@ from lerobot.envs.configs import LiberoEnv
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
+    Filmed,
     SimulatorSetup,
     check_quality,
     chosen_quality,
@@ -21,7 +22,7 @@ from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 
 
 @dataclass
-class LiberoConfig(LiberoEnv):
+class LiberoConfig(LiberoEnv, Filmed):
     """Recovery scenarios on LIBERO."""
 
     assets_dir: str = ""

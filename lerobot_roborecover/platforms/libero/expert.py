@@ -116,7 +116,7 @@ class LiberoExpert:
         center = (ring.min(0) + ring.max(0))[:2] / 2
         radius = np.percentile(np.linalg.norm(ring[:, :2] - center, axis=1), 70) - 0.004
         obstacles = self._obstacles()
-        best, best_score = None, -np.inf
+        grasps: list[tuple[float, np.ndarray, np.ndarray]] = []
         for k in range(24):
             angle = 2 * np.pi * (k + 0.5 * self._tries) / 24
             axis = np.array([np.cos(angle), np.sin(angle)])
@@ -127,9 +127,9 @@ class LiberoExpert:
                 ).min()
             turn = np.arccos(min(1.0, abs(axis @ self._scene.closing_axis)))
             score = 20 * min(clearance, 0.05) - 0.5 * turn
-            if score > best_score:
-                best, best_score = (center + radius * axis, axis), score
-        return best
+            grasps.append((score, center + radius * axis, axis))
+        _, point, axis = max(grasps, key=lambda grasp: grasp[0])
+        return point, axis
 
     def _across_grasp(self, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """An object's middle, and of its narrow directions the one nearest to the fingers'; (2,) and (2,)."""

@@ -220,8 +220,8 @@ class LiberoSimulator:
 
     def snapshot(self) -> bytes:
         """The complete state, a few kilobytes."""
-        self._require_reset()
-        return self._task.snapshot(clock=self._clock.state)
+        clock = self._require_reset()
+        return self._task.snapshot(clock=clock.state)
 
     def restore(self, snapshot: bytes) -> None:
         """Puts a snapshot of the same task back; observations are valid after a further `step`.
@@ -229,8 +229,8 @@ class LiberoSimulator:
         Raises:
             SimulatorError: not reset, or the snapshot is not of this task.
         """
-        self._require_reset()
-        self._clock.state = self._task.restore(snapshot)["clock"]
+        clock = self._require_reset()
+        clock.state = self._task.restore(snapshot)["clock"]
 
     def fixtures(self) -> Mapping[str, Pose]:
         """Poses of the fixtures that LIBERO draws at random at each reset; its init states lack them."""
@@ -263,7 +263,7 @@ class LiberoSimulator:
         }
 
     def _after_substep(self) -> None:
-        if self._clock.tick():
+        if self._require_reset().tick():
             self._view.sample()
 
     def _drop(self, key: tuple[str, str]) -> None:
@@ -273,9 +273,10 @@ class LiberoSimulator:
         if getattr(self, "_task", None) is task:
             self._clock = None
 
-    def _require_reset(self) -> None:
+    def _require_reset(self) -> ObservableClock:
         if self._clock is None:
             raise SimulatorError("the LIBERO simulator was not reset; call reset(task, reset) first")
+        return self._clock
 
 
 def _require(option: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -167,8 +167,9 @@ class LiberoTask:
         self._used = True
         self._site_rgba = self.model.site_rgba.copy()
         self.robot.gripper.current_action = np.zeros(2)
-        drawn = self._first_resets.get(seed)
-        for name, pose in (fixtures or drawn.fixtures).items():
+        drawn = None if seed is None else self._first_resets[seed]
+        poses = fixtures if drawn is None else fixtures or drawn.fixtures
+        for name, pose in poses.items():
             body = self.fixture_bodies[name]
             x, y, z, w = pose.quat_xyzw
             self.model.body_pos[body] = pose.position_m
@@ -242,7 +243,8 @@ class LiberoTask:
         else:
             base = self.data.body(self.robot.robot_model.root_body).xpos[:2]
             low, high = base - _REACH_M, base + _REACH_M
-        return Workspace((*map(float, low), z - 0.05), (*map(float, high), z + 1.0), float(z))
+        (low_x, low_y), (high_x, high_y) = map(float, low), map(float, high)
+        return Workspace((low_x, low_y, z - 0.05), (high_x, high_y, z + 1.0), float(z))
 
     def fixtures(self) -> dict[str, Pose]:
         """Poses of the fixtures that LIBERO draws at reset, as the model holds them."""

@@ -9,6 +9,7 @@ from lerobot.envs.configs import MetaworldEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.platforms.base import (
+    Filmed,
     SimulatorSetup,
     check_quality,
     chosen_quality,
@@ -19,7 +20,7 @@ from lerobot_roborecover.platforms.base import (
 
 
 @dataclass
-class MetaworldConfig(MetaworldEnv):
+class MetaworldConfig(MetaworldEnv, Filmed):
     """Recovery scenarios on Meta-World."""
 
     observation_height: int = 480

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
+from metaworld.policies.policy import Policy
 
 from lerobot_roborecover.platforms.base import Driver
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
@@ -99,7 +100,7 @@ def weak_grip_expert(simulator: MetaworldSimulator, task_name: str, rng: np.rand
     return act
 
 
-def _clipped(policy: object, raw: np.ndarray) -> np.ndarray:
+def _clipped(policy: Policy, raw: np.ndarray) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "Constant(s) may be too high": about the clipping done here
         action = policy.get_action(raw)

@@ -56,6 +56,6 @@ def marks(task_name: str, handled: str | None, raw: np.ndarray) -> dict[str, Pos
         return {}
     goal = raw[_GOAL] + FINAL_OFFSET_M.get(task_name, (0.0, 0.0, 0.0))
     return {
-        f"{handled}{HANDLE}": Pose(tuple(map(float, raw[_OBJECT])), _UPRIGHT),
-        GOAL: Pose(tuple(map(float, goal)), _UPRIGHT),
+        f"{handled}{HANDLE}": Pose(tuple(raw[_OBJECT]), _UPRIGHT),
+        GOAL: Pose(tuple(goal), _UPRIGHT),
     }

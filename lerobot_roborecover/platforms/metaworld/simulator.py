@@ -264,7 +264,7 @@ class MetaworldSimulator:
         """The box of the hand's targets, with the fingertips' 5 cm below; the table's top is at 0."""
         env = self._ready()
         low = env.mocap_low - np.array([0.0, 0.0, _FINGERS_M])
-        return Workspace(tuple(map(float, low)), tuple(map(float, env.mocap_high)), 0.0)
+        return Workspace(tuple(low.tolist()), tuple(env.mocap_high.tolist()), 0.0)
 
     def fixtures(self) -> Mapping[str, Pose]:
         """None: the seed decides everything."""

@@ -10,7 +10,7 @@ from lerobot.envs.configs import RoboTwinEnvConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import SimulatorSetup, first_camera, no_video, refuse_unused
+from lerobot_roborecover.platforms.base import Filmed, SimulatorSetup, first_camera, no_video, refuse_unused
 from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 from lerobot_roborecover.platforms.robotwin.processors import (
     MOSAIC,
@@ -21,7 +21,7 @@ from lerobot_roborecover.platforms.robotwin.processors import (
 
 
 @dataclass
-class RobotwinConfig(RoboTwinEnvConfig):
+class RobotwinConfig(RoboTwinEnvConfig, Filmed):
     """Recovery scenarios on RoboTwin 2.0."""
 
     robotwin_root: str = ""

@@ -84,9 +84,11 @@ class XVLAActionStep(ProcessorStep):
         """Converts the (B, 20) action.
 
         Raises:
-            ValueError: the action has another width.
+            ValueError: the action is no tensor, or has another width.
         """
-        action = transition[TransitionKey.ACTION]
+        action = transition[TransitionKey.ACTION.value]
+        if not isinstance(action, torch.Tensor):
+            raise ValueError(f"X-VLA's end-effector action is a tensor (B, 20), got {type(action).__name__}")
         if action.shape[-1] != 20:
             raise ValueError(
                 f"X-VLA's end-effector action has 20 values, this checkpoint gives {action.shape[-1]}. A "
@@ -98,7 +100,7 @@ class XVLAActionStep(ProcessorStep):
             closing = arm[:, 9:10] > _GRIPPER_CLOSES_ABOVE
             arms += [arm[:, :3], _quaternions(arm[:, 3:9]), np.where(closing, -1.0, 1.0)]
         out = transition.copy()
-        out[TransitionKey.ACTION] = torch.from_numpy(np.concatenate(arms, axis=1))
+        out[TransitionKey.ACTION.value] = torch.from_numpy(np.concatenate(arms, axis=1))
         return out
 
     def transform_features(self, features: Any) -> Any:

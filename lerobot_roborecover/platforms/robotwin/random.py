@@ -10,15 +10,25 @@ import contextlib
 import random
 import sys
 from collections.abc import Generator
+from typing import Any, NamedTuple
 
 import numpy as np
+
+
+class _States(NamedTuple):
+    """Of the global generators; torch's where it is imported, CUDA's where it is in use."""
+
+    python: tuple[Any, ...]
+    numpy: Any
+    torch: Any
+    cuda: Any
 
 
 class RandomStreams:
     """The task's own states of the global generators, swapped in while its code runs."""
 
     def __init__(self):
-        self._state: tuple | None = None
+        self._state: _States | None = None
 
     @contextlib.contextmanager
     def fresh(self, seed: int) -> Generator[None]:
@@ -42,28 +52,33 @@ class RandomStreams:
 
     def numpy_state(self) -> list:
         """numpy's state of the task's stream as plain values."""
-        name, keys, position, has_gauss, gauss = self._state[1]
+        name, keys, position, has_gauss, gauss = self._begun().numpy
         return [name, keys.tolist(), position, has_gauss, gauss]
 
     def set_numpy_state(self, state: list) -> None:
         """Puts `numpy_state` back."""
         restored = (state[0], np.array(state[1], dtype=np.uint32), *state[2:])
-        self._state = (self._state[0], restored, *self._state[2:])
+        self._state = self._begun()._replace(numpy=restored)
+
+    def _begun(self) -> _States:
+        if self._state is None:
+            raise RuntimeError("the task's stream has not begun: `fresh` begins it")
+        return self._state
 
     @staticmethod
-    def _get() -> tuple:
+    def _get() -> _States:
         torch = sys.modules.get("torch")
         cuda = None
         if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
             cuda = torch.cuda.get_rng_state_all()
-        return (random.getstate(), np.random.get_state(), torch and torch.get_rng_state(), cuda)
+        state = torch and torch.get_rng_state()
+        return _States(random.getstate(), np.random.get_state(), state, cuda)
 
     @staticmethod
-    def _set(state: tuple) -> None:
-        torch = sys.modules.get("torch")
-        random.setstate(state[0])
-        np.random.set_state(state[1])
-        if state[2] is not None:
-            torch.set_rng_state(state[2])
-        if state[3] is not None:
-            torch.cuda.set_rng_state_all(state[3])
+    def _set(state: _States) -> None:
+        random.setstate(state.python)
+        np.random.set_state(state.numpy)
+        if state.torch is not None:
+            sys.modules["torch"].set_rng_state(state.torch)
+        if state.cuda is not None:
+            sys.modules["torch"].cuda.set_rng_state_all(state.cuda)

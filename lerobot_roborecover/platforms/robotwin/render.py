@@ -107,7 +107,9 @@ def no_rendering() -> Generator[None]:
         set_ambient_light = set_environment_map = update_render = _ignore
         ambient_light = (0.5, 0.5, 0.5)
 
-        def add_ground(self, altitude: float, render: bool = True, material: Any = None, *_: Any) -> Any:
+        def add_ground(
+            self, altitude: Any, render: bool = True, material: Any = None, *_: Any, **__: Any
+        ) -> Any:
             return super().add_ground(altitude, render=False, material=material)
 
     def create_scene(self: Any, config: Any = None) -> Scene:
@@ -149,7 +151,7 @@ class _Dummy:
         return self
 
 
-def _dummy(*_: Any, **__: Any) -> _Dummy:
+def _dummy(*_: Any, **__: Any) -> Any:
     return _Dummy()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -76,7 +76,7 @@ class RobotwinRobot:
         """How far each wrist is from the paper's, with all joints at 0, by side."""
         return self.from_recorded_mm(RELEASED_ENDS_M)
 
-    def from_recorded_mm(self, wrists_m: dict[str, Sequence[float]]) -> dict[str, float]:
+    def from_recorded_mm(self, wrists_m: Mapping[str, Sequence[float]]) -> dict[str, float]:
         """How far each wrist is, with all joints at 0, from where a record has it, by side.
 
         Args:

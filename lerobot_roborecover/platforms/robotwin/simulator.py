@@ -286,7 +286,8 @@ def _compose(deltas: np.ndarray, start: np.ndarray) -> np.ndarray:
     for arm in (0, 8):
         p, q = slice(arm, arm + 3), slice(arm + 3, arm + 7)
         out[p] = start[p] + deltas[p]
-        out[q] = (Rotation.from_quat(start[q]) * Rotation.from_quat(deltas[q])).as_quat()
+        turned = Rotation.from_quat(start[q]) * Rotation.from_quat(deltas[q])
+        out[q] = turned.as_quat()  # ty: ignore[missing-union-attribute] - NotImplemented is no result
     return out
 
 

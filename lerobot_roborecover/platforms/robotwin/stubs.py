@@ -55,15 +55,19 @@ def install() -> None:
         _register("mplib.sapien_utils", SapienPlanner=Planner, SapienPlanningWorld=_PlanningWorld)
     if not has_curobo() and "curobo" not in sys.modules:
         refuse = _refusal("curobo", "planning a motion")
+        has: dict[str, dict[str, Any]] = {
+            "curobo.types.math": {"Pose": refuse},
+            "curobo.types.robot": {"JointState": refuse},
+            "curobo.util": {"logger": _Logger},
+            "curobo.wrap.reacher.motion_gen": {
+                "MotionGen": _MotionGen,
+                "MotionGenConfig": _MotionGenConfig,
+                "MotionGenPlanConfig": refuse,
+                "PoseCostMetric": refuse,
+            },
+        }
         for name in _CUROBO:
-            _register(name)
-        sys.modules["curobo.types.math"].Pose = refuse
-        sys.modules["curobo.types.robot"].JointState = refuse
-        sys.modules["curobo.util"].logger = _Logger
-        motion_gen = sys.modules["curobo.wrap.reacher.motion_gen"]
-        motion_gen.MotionGen = _MotionGen
-        motion_gen.MotionGenConfig = _MotionGenConfig
-        motion_gen.MotionGenPlanConfig = motion_gen.PoseCostMetric = refuse
+            _register(name, **has.get(name, {}))
     elif has_curobo():
         try:
             importlib.import_module(_CUROBO[-1])
@@ -127,7 +131,7 @@ def _time_optimal(
     is in every action, of the other one in every replay of a prefix. Some 25 KB each.
     """
     import toppra
-    from toppra import algorithm, constraint
+    from toppra import algorithm, constraint, parametrizer
 
     joints = np.frombuffer(path).reshape(shape)
     spline = toppra.SplineInterpolator(np.linspace(0, 1, shape[0]), joints)
@@ -136,7 +140,7 @@ def _time_optimal(
         constraint.JointAccelerationConstraint(np.ones(shape[1])),
     ]
     trajectory = algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel").compute_trajectory()
-    if trajectory is None:
+    if not isinstance(trajectory, parametrizer.ParametrizeConstAccel):
         return None
     times = np.linspace(0, trajectory.duration, int(trajectory.duration / step))
     return times, trajectory(times), trajectory(times, 1), trajectory(times, 2), trajectory.duration
