@@ -77,7 +77,7 @@ def contrasts(
         return []
     differences = np.stack([rates[a] - rates[b] for a, b in pairs])
     totals = [_unit_totals(values, resampling) for values in differences]
-    columns = resampling.spread(differences)
+    units = np.asarray(resampling.spread(differences).units)
     estimates = resampling.differences(differences.T)
     found = [
         Contrast(
@@ -87,7 +87,7 @@ def contrasts(
             sign_flip_p(totals[k]),
             float("nan"),
             int(np.isfinite(differences[k]).sum()),
-            int(columns.units[k]),
+            int(units[k]),
             differing(totals[k]),
             0,
             complete,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import Estimate, difference_interval
+from lerobot_roborecover.analysis.intervals import Estimate, difference_interval, estimate_of
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
 
@@ -218,7 +218,7 @@ def gain_over(
     # Another sample of scenarios may choose another: as much as the choices of these divisions differ.
     rates = (y / k).mean(1)
     found = replace(found, variance=times * found.variance + float((rates[best] - rates[0]).var()))
-    return Estimate(found.value, *difference_interval(found, resampling.level))
+    return estimate_of(found.value, difference_interval(found, resampling.level))
 
 
 def _by_scenarios(rates: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.results import Results
@@ -47,7 +49,7 @@ def _intervals(results: Results, best: int, rate: Estimate) -> str:
     level = f"{100 * results.draws.level:g} % interval"
     text = f" ({level} {_bounds(rate)}, over {results.ranked_draws.units} {results.unit}"
     if results.tasks is not None:
-        draws = results.tasks.part(list(results.compared.scenarios))
+        draws = results.tasks.part(np.array(results.compared.scenarios, int))
         (tasks,) = draws.rates(results.ranked.rates[[best]].T)
         if not math.isnan(tasks.low):
             text += f"; {_bounds(tasks)} for other tasks like these {draws.units}"

@@ -56,7 +56,7 @@ class Spread:
     value: float | np.ndarray
     variance: float | np.ndarray
     """Of the mean, between units; NaN for fewer than two."""
-    units: int | np.ndarray
+    units: float | np.ndarray
     effective: float | np.ndarray
     """Units of one weight that would weigh as these do: 1 over the sum of their squared weights."""
     freedom: float | np.ndarray
@@ -180,12 +180,25 @@ def _over(top: np.ndarray | float, bottom: np.ndarray) -> np.ndarray:
     return np.divide(top, bottom, out=np.zeros(shape), where=np.asarray(bottom) > 0)
 
 
-def _plain(column: np.ndarray):
+def _plain(column: np.ndarray) -> float | np.ndarray:
     """Without the last axis; a number where that was the only one."""
     return column[..., 0] if column.ndim > 1 else column[0].item()
 
 
 Bounds = tuple[float, float] | tuple[np.ndarray, np.ndarray]
+"""Low and high: numbers of one column, arrays of several."""
+
+
+def estimate_of(value: float | np.ndarray, bounds: Bounds) -> Estimate:
+    """One column's number with its bounds."""
+    low, high = bounds
+    return Estimate(float(value), float(low), float(high))
+
+
+def estimates_of(values: float | np.ndarray, bounds: Bounds) -> list[Estimate]:
+    """Several columns' numbers, each with its bounds."""
+    columns = (np.asarray(part).tolist() for part in (values, *bounds))
+    return [Estimate(*parts) for parts in zip(*columns, strict=True)]
 
 
 def rate_interval(found: Spread, level: float = LEVEL) -> Bounds:

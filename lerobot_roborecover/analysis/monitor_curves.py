@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, jackknife, rate_interval
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, jackknife, rate_interval
 from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames, fewer, metric_columns
 
 
@@ -72,16 +72,18 @@ def roc(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
             rates.append(np.insert(counts / total if total else np.full(len(counts), np.nan), 0, 0.0))
         return rates[0], rates[1]
 
+    def under(x: np.ndarray, y: np.ndarray) -> float:
+        return float(np.trapezoid(y, x))
+
     x, y = curve(np.ones(len(rows)))
-    left_out = [np.trapezoid(*reversed(curve(rows != i))) for i in range(count)]
+    left_out = [under(*curve(rows != i)) for i in range(count)]
     by_label = [np.bincount(rows[label == one], minlength=count) for one in (0, 1)]
-    area = _area(float(np.trapezoid(y, x)), left_out, fewer(*by_label), level)
+    area = _area(under(x, y), left_out, fewer(*by_label), level)
     return Curve(x, y, np.insert(score[last], 0, np.inf), area)
 
 
 def _area(value: float, left_out: list[float], weights: np.ndarray, level: float) -> Estimate:
-    low, high = rate_interval(jackknife(value, np.array(left_out, float), weights), level)
-    return Estimate(value, low, high)
+    return estimate_of(value, rate_interval(jackknife(value, np.array(left_out, float), weights), level))
 
 
 RULES = ("macro_f1", "f1", "accuracy", "youden")

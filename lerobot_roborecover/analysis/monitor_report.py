@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, jackknife, rate_interval
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimates_of, jackknife, rate_interval
 from lerobot_roborecover.analysis.monitor import (
     METRICS,
     EpisodeMetrics,
@@ -46,11 +46,11 @@ def monitor_report(frames: MonitorFrames, *, level: float = LEVEL) -> MonitorRep
     """
     ids, row = np.unique(frames.scenario, return_inverse=True)
     counts = confusion_by_scenario(frames, row, len(ids))
-    total = counts.sum(0)
+    tn, fp, fn, tp = (int(v) for v in counts.sum(0))
     return MonitorReport(
         frames=len(frames.label),
         scenarios=len(ids),
-        confusion=tuple(int(v) for v in total),
+        confusion=(tn, fp, fn, tp),
         unparsed=int((~frames.parsed).sum()),
         metrics=metric_estimates(counts, level),
         episodes=episode_metrics(frames, level),
@@ -68,5 +68,5 @@ def metric_estimates(counts: np.ndarray, level: float = LEVEL) -> dict[str, Esti
     """
     total = counts.sum(0)
     (point,), left_out = metric_columns(total[None]), metric_columns(total - counts)
-    low, high = rate_interval(jackknife(point, left_out.T, metric_weights(counts).T), level)
-    return {name: Estimate(float(point[k]), float(low[k]), float(high[k])) for k, name in enumerate(METRICS)}
+    bounds = rate_interval(jackknife(point, left_out.T, metric_weights(counts).T), level)
+    return dict(zip(METRICS, estimates_of(point, bounds), strict=True))

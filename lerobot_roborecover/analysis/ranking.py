@@ -39,7 +39,9 @@ class RankAgreement:
     """Kendall's tau-b, with bounds from the same pairs."""
 
 
-def inverted_pairs(initial: Sequence[float], recovery: Sequence[float]) -> list[tuple[int, int]]:
+def inverted_pairs(
+    initial: Sequence[float] | np.ndarray, recovery: Sequence[float] | np.ndarray
+) -> list[tuple[int, int]]:
     """Index pairs that swap order, the initially higher one first."""
     found = []
     for a, b in combinations(range(len(initial)), 2):

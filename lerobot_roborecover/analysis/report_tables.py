@@ -401,8 +401,9 @@ def beside_published(results: Results) -> Table:
     whole = macro_estimates(panel, draws)
     macro = [m if not math.isnan(w.value) else _NOBODY for m, w in zip(macro, whole, strict=True)]
     initial = initial_estimates(results, as_in_the_paper=True)
-    rows: list[tuple[Cell, ...]] = [
-        (policy, "this report", initial[p], rsr[p], macro[p], None) for p, policy in enumerate(panel.arms)
+    rated: list[tuple[Estimate, tuple[Cell, ...]]] = [
+        (rsr[p], (policy, "this report", initial[p], rsr[p], macro[p], None))
+        for p, policy in enumerate(panel.arms)
     ]
     remarks = []
     for row in published.policies(results.study.platform):
@@ -411,8 +412,8 @@ def beside_published(results: Results) -> Table:
             plus = "not published"
         elif row.libero_plus_note:
             remarks.append(f"{row.policy} ({row.platform}): {row.libero_plus_note}")
-        rows.append((row.policy, "published", row.initial, row.rsr, row.macro9, plus))
-    rows.sort(key=lambda cells: -cells[3].value)
+        rated.append((row.rsr, (row.policy, "published", row.initial, row.rsr, row.macro9, plus)))
+    rows = tuple(cells for _, cells in sorted(rated, key=lambda pair: -pair[0].value))
     columns = (
         Column("Policy"), Column("Origin"), Column("Initial state %", "percent"),
         Column("RSR %", "percent"), Column("Macro %", "percent"), Column("LIBERO-Plus %", "percent"),
@@ -425,4 +426,4 @@ def beside_published(results: Results) -> Table:
         "are on the paper's 200 test scenarios of the platform. LIBERO-Plus: totals published by others, "
         f"another benchmark{said}.",
     )
-    return Table("published", "Beside the published results", columns, tuple(rows), notes)
+    return Table("published", "Beside the published results", columns, rows, notes)

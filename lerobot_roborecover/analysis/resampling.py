@@ -21,6 +21,7 @@ from lerobot_roborecover.analysis.intervals import (
     Spread,
     clean,
     difference_interval,
+    estimates_of,
     rate_interval,
     ratio_interval,
     spread,
@@ -53,7 +54,9 @@ class Resampling:
         """Of some of the scenarios, by index, with the same draws, seed and level."""
         return resample(self.index[scenarios], self.draws, self.seed, self.level)
 
-    def rates(self, values: np.ndarray, *, cells: np.ndarray | None = None, weights=None) -> list[Estimate]:
+    def rates(
+        self, values: np.ndarray, *, cells: np.ndarray | None = None, weights: np.ndarray | None = None
+    ) -> list[Estimate]:
         """Mean of each of (N, K) columns of numbers from 0 to 1, with its interval.
 
         Args:
@@ -76,7 +79,7 @@ class Resampling:
         both = np.isfinite(top) & np.isfinite(bottom)
         upper, lower = (np.where(both, rates, 0.0).sum(0) for rates in (top, bottom))
         values = np.divide(upper, lower, out=np.full(len(lower), np.nan), where=lower > 0)
-        return _estimates(values, *ratio_interval(top.T, bottom.T, self.index, self.level))
+        return estimates_of(values, ratio_interval(top.T, bottom.T, self.index, self.level))
 
     def spread(self, values: np.ndarray, cells: np.ndarray | None = None) -> Spread:
         """Of (..., N) values: one column of scenarios, or several."""
@@ -91,7 +94,7 @@ class Resampling:
     ) -> list[Estimate]:
         own = None if weights is None else weights.T
         columns = spread(values.T, self.index, cells=cells, weights=own)
-        return _estimates(columns.value, *interval(columns, self.level))
+        return estimates_of(columns.value, interval(columns, self.level))
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Means of every draw over the scenarios that have a value.
@@ -148,10 +151,6 @@ class Resampling:
             else Estimate(float(p), np.nan, np.nan)
             for p, a, b, n in zip(points, low, high, count, strict=True)
         ]
-
-
-def _estimates(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Estimate]:
-    return [Estimate(*bounds) for bounds in zip(values.tolist(), low.tolist(), high.tolist(), strict=True)]
 
 
 def resample(

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from lerobot_roborecover.analysis.intervals import (
     clean,
     difference_interval,
     difference_p,
+    estimate_of,
     rate_interval,
 )
 from lerobot_roborecover.analysis.logs import Arm
@@ -147,14 +147,9 @@ def method_rate(found: RunRates, resampling: Resampling) -> MethodRate:
         _noise(found),
         float(means.min()),
         float(means.max()),
-        _estimate_of(crossed.value, interval) if several else UNDEFINED,
+        estimate_of(crossed.value, interval) if several else UNDEFINED,
         hierarchical_bootstrap(found, resampling) if several else UNDEFINED,
     )
-
-
-def _estimate_of(value: Any, bounds: Any) -> Estimate:
-    """A number with its bounds, as `intervals.py` gives them for one column."""
-    return Estimate(float(value), float(bounds[0]), float(bounds[1]))
 
 
 def _noise(found: RunRates) -> float:
@@ -241,7 +236,7 @@ def method_contrasts(
         known = np.isfinite(a.rates).all(0) & np.isfinite(b.rates).all(0)
         part = resampling.part(np.flatnonzero(known))
         spread_ = crossed_difference(a.rates[:, known], b.rates[:, known], part)
-        estimate = _estimate_of(spread_.value, difference_interval(spread_, resampling.level))
+        estimate = estimate_of(spread_.value, difference_interval(spread_, resampling.level))
         rows.append((c, (len(a.runs), len(b.runs)), estimate, difference_p(spread_)))
     enough = [c.complete and not c.sequential and min(n) >= LEAST_RUNS for c, n, _, _ in rows]
     adjusted = np.full(len(rows), np.nan)

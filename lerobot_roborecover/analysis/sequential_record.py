@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from lerobot_roborecover.env.trial_log import TrialLogError
 from lerobot_roborecover.whole import write_whole
@@ -105,5 +106,6 @@ def _checked(values: dict) -> SequentialRecord:
         raise ValueError(f"field 'level': {values['level']} is not from 0.5 to 1")
     if len(set(values["scenarios"])) != len(values["scenarios"]) or not values["scenarios"]:
         raise ValueError("field 'scenarios': ids must be there, each once")
-    known = {field.name: values[field.name] for field in fields(SequentialRecord)}
-    return SequentialRecord(**{**known, "scenarios": tuple(values["scenarios"])})
+    known: dict[str, Any] = {field.name: values[field.name] for field in fields(SequentialRecord)}
+    known["scenarios"] = tuple(values["scenarios"])
+    return SequentialRecord(**known)

@@ -10,9 +10,12 @@ import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_roborecover.analysis.tables import NOT_DEFINED
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f5f00")
 """Okabe and Ito's palette, dark ones first."""
@@ -47,7 +50,7 @@ _DARK = {
 """A dark page's colour for each of the figures' own."""
 SURFACE_DARK = _DARK[PAPER]
 
-_RC = {
+_RC: dict[RcKeyType, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.5,
     "text.color": INK,

@@ -14,7 +14,7 @@ from lerobot_roborecover.analysis.estimators import (
     invalid_counts,
     scenario_rates,
 )
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, rate_interval, spread
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
 from lerobot_roborecover.scenario import DeviationType, Stage, Start
 
 UNDERPOWERED_BELOW = 10
@@ -121,7 +121,7 @@ def rate_estimate(
         level: confidence level.
     """
     found = spread(rates, units, cells=cells)
-    return Estimate(found.value, *rate_interval(found, level))
+    return estimate_of(found.value, rate_interval(found, level))
 
 
 def _cell_order(cell: str) -> tuple[int, int]:

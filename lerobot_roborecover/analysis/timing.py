@@ -18,7 +18,9 @@ FRACTIONS = (0.25, 0.5, 0.75, 1.0)
 """Budgets shown in the table, as shares of each scenario's horizon."""
 
 
-def rates_within(panel: Panel, budgets: Sequence[float], *, of_horizon: bool = True) -> np.ndarray:
+def rates_within(
+    panel: Panel, budgets: Sequence[float] | np.ndarray, *, of_horizon: bool = True
+) -> np.ndarray:
     """Scenario rates with a smaller budget.
 
     Args:
@@ -41,7 +43,7 @@ def rates_within(panel: Panel, budgets: Sequence[float], *, of_horizon: bool = T
 
 
 def budget_estimates(
-    panel: Panel, budgets: Sequence[float], resampling: Resampling, *, of_horizon: bool = True
+    panel: Panel, budgets: Sequence[float] | np.ndarray, resampling: Resampling, *, of_horizon: bool = True
 ) -> list[list[Estimate]]:
     """RSR of every policy at every budget, with intervals: P lists of B estimates."""
     rates = rates_within(panel, budgets, of_horizon=of_horizon)
