@@ -24,6 +24,7 @@ from lerobot_roborecover.scenario import (
     Fingerprint,
     Outcome,
     Pose,
+    Reset,
     Rollout,
     Scenario,
     ScenarioError,
@@ -82,7 +83,7 @@ def hand_off(
             recorded, which is never a `state_mismatch`.
     """
     began = time.perf_counter()
-    if check and scenario.fingerprint is not None:
+    if check:
         check_robot(simulator, scenario)
     step = scenario.handoff_step(start, rewind_steps)
     state, from_snapshot = replay_to(simulator, scenario.rollout, step, cache)
@@ -99,11 +100,14 @@ def hand_off(
 
 
 def check_robot(simulator: Simulator, scenario: TrialStart) -> None:
-    """Checks that the simulator has the robot that recorded a scenario, as far as its fingerprint says.
+    """Checks that the simulator has the robot that recorded a scenario, as far as its fingerprint, if it has
+    one, says.
 
     Raises:
         SimulatorError: another one; the message says in what it differs, worst first.
     """
+    if scenario.fingerprint is None:
+        return
     here = simulator.fingerprint()
     robots = compare_robots(scenario.fingerprint.versions, here)
     if robots.another:
@@ -214,10 +218,20 @@ def _compare(handoff: Handoff, bodies: Mapping[str, Pose], fingerprint: Fingerpr
 def with_fingerprint(
     simulator: Simulator, scenario: Scenario, frames_png: tuple[bytes, ...] = ()
 ) -> Scenario:
-    """Replays a scenario that has no fingerprint yet and returns it with one.
+    """Replays a scenario that has no fingerprint yet and returns it with what `record_handoff` finds.
 
-    Also records the fixture poses of the reset, where the platform draws them at random and the scenario
-    lacks them.
+    Raises:
+        ScenarioError: the prefix already solves the task, so that there is nothing to recover.
+    """
+    reset, fingerprint = record_handoff(simulator, scenario, frames_png)
+    return replace(scenario, reset=reset, fingerprint=fingerprint)
+
+
+def record_handoff(
+    simulator: Simulator, scenario: Scenario, frames_png: tuple[bytes, ...] = ()
+) -> tuple[Reset, Fingerprint]:
+    """Replays a scenario to its handoff: its reset, with the fixture poses where the platform draws them at
+    random and the scenario lacks them, and the handoff's fingerprint.
 
     Raises:
         ScenarioError: the prefix already solves the task, so that there is nothing to recover.
@@ -229,11 +243,10 @@ def with_fingerprint(
     handoff = hand_off(simulator, scenario, check=False)
     if handoff.problem is Outcome.SOLVED_BY_PREFIX:
         raise ScenarioError(f"scenario {scenario.id}: {handoff.reason}; there is nothing to recover from")
-    fingerprint = Fingerprint(
+    return scenario.reset, Fingerprint(
         step=handoff.step,
         bodies=simulator.bodies(),
         state_sha256=handoff.state_sha256,
         versions=simulator.fingerprint(),
         frames_png=frames_png,
     )
-    return replace(scenario, fingerprint=fingerprint)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
+from lerobot_roborecover.platforms.simulator import ControlModes, Simulator, SimulatorError
 from lerobot_roborecover.platforms.walk import advance
 from lerobot_roborecover.replay import replay_to
 from lerobot_roborecover.scenario import Rollout
@@ -72,7 +72,7 @@ class Trail:
 
     def set_control_mode(self) -> None:
         """Has the simulator read actions as the policy gives them."""
-        if self._control_mode is not None and hasattr(self._simulator, "set_control_mode"):
+        if self._control_mode is not None and isinstance(self._simulator, ControlModes):
             self._simulator.set_control_mode(self._control_mode)
 
     def step(self, action: np.ndarray) -> None:

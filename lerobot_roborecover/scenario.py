@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -109,6 +109,9 @@ class Outcome(StrEnum):
         return self in (Outcome.SUCCESS, Outcome.HORIZON)
 
 
+_POSE = "pose must be 3 finite metres and 4 finite quaternion terms"
+
+
 @dataclass(frozen=True)
 class Pose:
     """A rigid pose in the world frame."""
@@ -119,11 +122,24 @@ class Pose:
     def __post_init__(self):
         p, q = tuple(map(float, self.position_m)), tuple(map(float, self.quat_xyzw))
         if len(p) != 3 or len(q) != 4 or not np.isfinite(p + q).all():
-            raise ScenarioError(f"pose must be 3 finite metres and 4 finite quaternion terms, got {p} {q}")
+            raise ScenarioError(f"{_POSE}, got {p} {q}")
         if abs(float(np.linalg.norm(q)) - 1.0) > 1e-3:
             raise ScenarioError(f"quaternion {q} has norm {np.linalg.norm(q):.4f}; a rotation has norm 1")
         object.__setattr__(self, "position_m", p)
         object.__setattr__(self, "quat_xyzw", q)
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Pose:
+        """From (7,) numbers, as they are kept in files: position in metres, then quaternion xyzw.
+
+        Raises:
+            ScenarioError: they are no seven, or no pose.
+        """
+        values = tuple(map(float, numbers))
+        if len(values) != 7:
+            raise ScenarioError(f"{_POSE}, got {values[:3]} {values[3:]}")
+        x, y, z, qx, qy, qz, qw = values
+        return cls((x, y, z), (qx, qy, qz, qw))
 
     def distance_m(self, other: Pose) -> float:
         """Euclidean distance between the two positions, metres."""

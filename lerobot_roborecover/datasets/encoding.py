@@ -107,7 +107,9 @@ def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int], nam
 
     quiet_video()
     try:
-        aggregate_datasets([f"roborecover/{s.name}" for s in sources], f"roborecover/{name}", sources, root)
+        aggregate_datasets(
+            [f"roborecover/{s.name}" for s in sources], f"roborecover/{name}", list(sources), root
+        )
     except ValueError as err:
         raise ScenarioError(f"the datasets cannot be joined: {err}") from err
     check_frames(root, steps, thorough=True)
@@ -182,9 +184,10 @@ class EpisodeWriter:
             robot_type=self._robot_type,
             streaming_encoding=True,
         )
-        theirs = dataset.writer._streaming_encoder
-        if theirs is not None:
-            dataset.writer._streaming_encoder = PatientEncoder(
+        writer = dataset.writer
+        theirs = None if writer is None else writer._streaming_encoder
+        if writer is not None and theirs is not None:
+            writer._streaming_encoder = PatientEncoder(
                 theirs.fps,
                 theirs._rgb_encoder,
                 theirs._depth_encoder,

@@ -18,7 +18,7 @@ from lerobot_roborecover.journal import AppendOnly, InUseError
 from lerobot_roborecover.platforms import SimulatorError, platform_named
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.versions import installed
-from lerobot_roborecover.replay import with_fingerprint
+from lerobot_roborecover.replay import record_handoff
 from lerobot_roborecover.scenario import Fingerprint, Pose, Scenario, ScenarioError
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
@@ -105,19 +105,18 @@ def _replay(scenarios: Sequence[Scenario], check: ResetCheck | None) -> list[dic
         try:
             simulator.reset(scenario.task, scenario.reset)
             deviations = check(simulator, scenario) if check else {}
-            replayed = with_fingerprint(simulator, scenario)
+            reset, mark = record_handoff(simulator, scenario)
         except (ScenarioError, SimulatorError) as err:
             entries.append({"id": scenario.id, "error": str(err)})
             continue
         except Exception as err:  # simulators raise types of their own; one record must not stop the others
             entries.append({"id": scenario.id, "error": f"{type(err).__name__}: {err}"})
             continue
-        mark = replayed.fingerprint
         entries.append(
             {
                 "id": scenario.id,
                 "deviations": deviations,
-                "fixtures": _pose_lists(replayed.reset.fixtures),
+                "fixtures": _pose_lists(reset.fixtures),
                 "step": mark.step,
                 "bodies": _pose_lists(mark.bodies),
                 "state_sha256": mark.state_sha256,
@@ -140,7 +139,7 @@ def _pose_lists(poses: Mapping[str, Pose]) -> dict[str, list[float]]:
 
 
 def _poses(lists: Mapping[str, Sequence[float]]) -> dict[str, Pose]:
-    return {name: Pose(tuple(p[:3]), tuple(p[3:])) for name, p in lists.items()}
+    return {name: Pose.of(p) for name, p in lists.items()}
 
 
 def _jobs(scenarios: Sequence[Scenario], rows: Sequence[int]) -> list[list[int]]:

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -58,14 +59,18 @@ def write_frames(folder: Path, frames: Iterable[LastFrames]) -> list[str]:
         ScenarioError: a limit of the format is exceeded.
     """
     names: list[str] = []
-    writer: pq.ParquetWriter | None = None
-    file = None
+    opened: tuple[pq.ParquetWriter, BinaryIO] | None = None
+
+    def close() -> None:
+        for part in opened or ():
+            part.close()
+
     try:
         for found in frames:
             _check(found)
             if not found.png:
                 continue
-            if writer is None:
+            if opened is None:
                 folder.mkdir(parents=True, exist_ok=True)
                 names.append(f"file-{len(names):03d}.parquet")
                 file = open(folder / names[-1], "wb")  # noqa: SIM115
@@ -73,6 +78,8 @@ def write_frames(folder: Path, frames: Iterable[LastFrames]) -> list[str]:
                 writer = pq.ParquetWriter(
                     file, SCHEMA, compression="none", use_dictionary=False, write_statistics=False
                 )
+                opened = writer, file
+            writer, file = opened
             rows = [
                 (found.scenario_id, found.sha256, found.step, camera, list(png))
                 for camera, png in found.png.items()
@@ -82,13 +89,10 @@ def write_frames(folder: Path, frames: Iterable[LastFrames]) -> list[str]:
             ]
             writer.write_table(pa.Table.from_arrays(columns, schema=SCHEMA))
             if file.tell() > MAX_FRAMES_BYTES // 2:
-                writer.close()
-                file.close()
-                writer = file = None
+                close()
+                opened = None
     finally:
-        if writer is not None:
-            writer.close()
-            file.close()
+        close()
     return names
 
 

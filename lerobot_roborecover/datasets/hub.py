@@ -16,6 +16,7 @@ from huggingface_hub.errors import (
     RepositoryNotFoundError,
     RevisionNotFoundError,
 )
+from huggingface_hub.hf_api import RepoFile
 
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
@@ -91,7 +92,7 @@ def _download(where: str, repo_id: str, revision: str | None) -> Path:
     sizes = {
         info.path: info.size
         for info in HfApi().get_paths_info(repo_id, list(_LIMITS), repo_type="dataset", revision=revision)
-        if hasattr(info, "size")
+        if isinstance(info, RepoFile)
     }
     for path, limit in _LIMITS.items():
         if path not in sizes:

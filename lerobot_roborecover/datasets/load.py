@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
 
@@ -37,7 +38,10 @@ class ScenarioSet(Sequence[Scenario]):
 
     def __post_init__(self):
         object.__setattr__(self, "scenarios", tuple(self.scenarios))
-        object.__setattr__(self, "_by_id", {s.id: s for s in self.scenarios})
+
+    @cached_property
+    def _by_id(self) -> dict[str, Scenario]:
+        return {s.id: s for s in self.scenarios}
 
     @property
     def platform(self) -> str:

@@ -108,6 +108,8 @@ def _frame_before(path: Path, end_s: float) -> np.ndarray | None:
         return None
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
+        if stream.time_base is None:
+            return None
         container.seek(max(int((end_s - 0.5) / stream.time_base), 0), stream=stream)
         found = None
         for frame in container.decode(stream):

@@ -151,20 +151,20 @@ def plan_publish(
         frames=config.frames,
     )
     validate(root, thorough=True)
-    local = {name: root / name for name in names}
-    local |= {
-        name: data for name, data in card.files.items() if name not in local or _replaceable(local[name])
-    }
+    own = {name: root / name for name in names}
+    local: dict[str, Path | bytes] = {**own}
+    local |= {name: data for name, data in card.files.items() if name not in own or _replaceable(own[name])}
     api, where = HfApi(), f"Hub dataset {config.repo_id}"
     refs, head, remote, unreachable = None, None, {}, ""
     attempts = 1 if to_show else ATTEMPTS
     try:
         missing = (RepositoryNotFoundError,)
         refs = again(lambda: _refs(api, config.repo_id), f"{where}: looking it up", missing, attempts)
-        head = refs["branches"].get("main")
-        if head:
+        main = refs["branches"].get("main")
+        if main:
+            head = main
             remote = again(
-                lambda: _remote_files(api, config.repo_id, head), f"{where}: listing", attempts=attempts
+                lambda: _remote_files(api, config.repo_id, main), f"{where}: listing", attempts=attempts
             )
     except RepositoryNotFoundError:
         pass
@@ -232,7 +232,7 @@ def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda don
         f"{where}: creating it",
     )
     commit = plan.head
-    if plan.add or plan.delete:
+    if commit is None or plan.add or plan.delete:
         adds = [CommitOperationAdd(name, _source(plan, name)) for name in plan.add]
         for begin in range(0, len(adds), _FILES_PER_UPLOAD):
             part = adds[begin : begin + _FILES_PER_UPLOAD]

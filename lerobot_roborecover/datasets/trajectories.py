@@ -75,8 +75,8 @@ class TrajectoryRow:
         """The reset, where it is known."""
         if self.reset is None:
             return None
-        fixtures = {n: Pose(tuple(p[:3]), tuple(p[3:])) for n, p in self.reset["fixtures"].items()}
-        return Reset(**{**self.reset, "fixtures": fixtures})
+        fixtures = {n: Pose.of(p) for n, p in self.reset["fixtures"].items()}
+        return Reset(fixtures=fixtures, **{k: v for k, v in self.reset.items() if k != "fixtures"})
 
 
 @dataclass(frozen=True)

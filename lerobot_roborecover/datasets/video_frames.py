@@ -155,6 +155,8 @@ def _frames_of(path: str, fps: float, size: int, mtime_ns: int, thorough: bool) 
         with av.open(path) as container:
             stream = container.streams.video[0]
             base = stream.time_base
+            if base is None:
+                raise ValueError("its video has no time base")
             if not thorough and stream.frames and stream.duration is not None:
                 places = float(stream.duration * base) * fps
                 # As many frames as the film is long, which `mp4` says of itself.

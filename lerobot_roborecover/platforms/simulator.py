@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -84,3 +84,11 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Frees the simulator; further calls are undefined."""
+
+
+@runtime_checkable
+class ControlModes(Protocol):
+    """What a simulator has beside `Simulator` that reads actions in more than one way."""
+
+    def set_control_mode(self, mode: str) -> None:
+        """Reads actions so from now on, until the next reset."""

@@ -106,11 +106,11 @@ def compare_with_stored(study: StudyDefinition, done: Sequence[Arm]) -> Comparis
 
 def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Report:
     """Writes the report page of the arms' logs."""
-    interventions = {"baseline": study.base, "interventions": tuple(study.interventions)}
+    options = Options(baseline=study.base, interventions=tuple(study.interventions))
     return report(
         [f"{arm.name}={arm.log}" for arm in done],
         out / "report",
-        options=Options(**interventions) if study.interventions else None,
+        options=options if study.interventions else None,
         gallery=Gallery(str(study.scenarios)),
         command=report_command(study, done, out),
     )

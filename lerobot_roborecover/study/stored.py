@@ -77,7 +77,7 @@ def summary_table(done: Sequence[Arm]) -> str:
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.report_tables import overall
     from lerobot_roborecover.analysis.results import Options, analyse
-    from lerobot_roborecover.analysis.tables import Table, to_markdown
+    from lerobot_roborecover.analysis.tables import Cell, Table, to_markdown
 
     policies = [arm for arm in done if arm.start == "initial"]
     names = {arm.name for arm in policies}
@@ -90,8 +90,8 @@ def summary_table(done: Sequence[Arm]) -> str:
         if column.title.startswith(("Policy", "Initial", "RSR %", "Macro", "Retention"))
         and "without" not in column.title
     ]
-    order = [results.ranked.arms[p] for p in results.best_first]
-    rows = sorted(whole.rows, key=lambda row: order.index(row[0]) if row[0] in order else len(order))
+    places: dict[Cell, int] = {results.ranked.arms[p]: place for place, p in enumerate(results.best_first)}
+    rows = sorted(whole.rows, key=lambda row: places.get(row[0], len(places)))
     table = Table(
         "overall",
         "The study's policies",

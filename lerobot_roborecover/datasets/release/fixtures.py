@@ -37,7 +37,7 @@ def released_fixtures() -> dict[tuple[str, str], dict[str, Pose]]:
     found = {}
     for name, poses in json.loads(text)["tasks"].items():
         suite, task = name.split("/", 1)
-        found[suite, task] = {n: Pose(tuple(p[:3]), tuple(p[3:])) for n, p in poses.items()}
+        found[suite, task] = {n: Pose.of(p) for n, p in poses.items()}
     return found
 
 

@@ -63,8 +63,8 @@ def to_json(scenario: Scenario) -> bytes:
     Raises:
         ScenarioError: the scenario was not made from the release.
     """
-    note = scenario.provenance.get(KEY)
     try:
+        note = scenario.provenance[KEY]
         form = note["json"]
         if "zlib" in form:
             unpacker = zlib.decompressobj()
