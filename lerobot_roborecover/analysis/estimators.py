@@ -8,7 +8,7 @@ failures.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,7 +120,7 @@ def _units(ids: Sequence[str], groups: list[list[Mapping[str, Any]]], unit: Unit
     return tuple(labels.tolist())
 
 
-def _label(group: list[Mapping[str, Any]], read) -> str:
+def _label(group: list[Mapping[str, Any]], read: Callable[[Mapping[str, Any]], str]) -> str:
     labels = {read(row) for row in group}
     if len(labels) > 1:
         raise RowsError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from lerobot_roborecover.analysis.style import (
     PAPER,
     SOFT,
     Figure,
+    Plot,
     Width,
     both,
     colour,
@@ -65,7 +65,7 @@ def forest(results: Results) -> Figure:
     order = [chosen[p] for p in reversed(results.best_first)]
     level = f"{100 * results.draws.level:g} % interval"
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 0.8 + row_height(width, 0.46) * len(order))
             for y, p in enumerate(order):
@@ -114,7 +114,7 @@ def rank_transition(results: Results) -> Figure:
     initial, recovery = masked_mean(initial_rates.T), masked_mean(recovery_rates.T)
     left, right = _ranks(initial), _ranks(recovery)
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 0.7 + 0.42 * len(index))
             for k, p in enumerate(index):
@@ -185,14 +185,14 @@ def _heat_map(
     sparse: Sequence[bool],
     solid: Sequence[tuple[int, int]] = (),
     dashed: Sequence[tuple[int, int]] = (),
-) -> tuple[Any, Any]:
+) -> tuple[Plot, Plot]:
     """Rows × policies as coloured fields with their numbers, wide and narrow."""
     from matplotlib import colormaps
     from matplotlib.patches import Rectangle
 
     shades = colormaps[HEAT]
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             tall = row_height(width, 0.44)
             plot, axes = subplots(width.inches, 0.9 + tall * len(labels) + 0.25 * width.narrow)
@@ -242,7 +242,7 @@ def paired_differences(results: Results) -> Figure:
     shown = [c for c in found if not math.isnan(c.difference.value)]
     level = f"{100 * results.draws.level:g} % interval"
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 0.9 + row_height(width, 0.3) * max(1, len(shown)))
             axes.axvline(0, color=SOFT, lw=1)

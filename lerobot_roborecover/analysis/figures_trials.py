@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from lerobot_roborecover.analysis.style import (
     PAPER,
     SOFT,
     Figure,
+    Plot,
     Width,
     both,
     colour,
@@ -51,7 +51,7 @@ def time_to_recover(results: Results) -> Figure:
     curves = budget_estimates(panel, grid, results.draws)
     order = sorted(range(len(curves)), key=lambda p: -np.nan_to_num(curves[p][-1].value))
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 3.4 + 0.24 * len(curves) if width.narrow else 4.2)
             for p in order:
@@ -88,7 +88,7 @@ def oracle_bars(results: Results) -> Figure:
         bars.append(("best of each scenario, cross-fitted", found.rate, PAPER))
     bars.append(("the same, in hindsight", found.hindsight, PAPER))
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 0.7 + row_height(width, 0.38) * len(bars))
             thick, shift = (0.36, -0.12) if width.narrow else (0.6, 0.0)
@@ -127,7 +127,7 @@ def _cross_fitted(found: Oracle) -> str:
 def interventions(results: Results) -> Figure:
     """Gain against cost in steps, one point an intervention, harm written beside it."""
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             lines = len(results.costs) * (2 if width.narrow else 1)
             plot, axes = subplots(width.inches, 3.0 + 0.22 * lines)
@@ -166,7 +166,7 @@ def mosaic(results: Results) -> Figure:
     share = np.array([len(arm.rows) for arm in arms], float)
     share = np.maximum(share / share.max(), 0.25)
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             columns = 2 if width.narrow else 4
             extra = 0.9 + 0.22 * math.ceil(len(kinds) / columns)

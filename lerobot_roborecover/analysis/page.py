@@ -12,10 +12,14 @@ import importlib.resources
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis.style import Figure, svg_of
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
 
 PHONE_PX = 640
 """Width of a window up to which the narrow drawings are shown."""
@@ -76,11 +80,11 @@ def grouped(remarks: Sequence[str], heads: Sequence[str]) -> Mapping[str, list[s
     return {head: texts for head, texts in found.items() if texts}
 
 
-def breakable(text: str) -> Any:
+def breakable(text: str) -> Markup:
     """A name as HTML that may go on in the next line after an underscore, slash or at sign."""
-    from markupsafe import Markup, escape
+    import markupsafe
 
-    return Markup(re.sub(r"([_/@])(?=\w)", r"\1<wbr>", str(escape(text))))
+    return markupsafe.Markup(re.sub(r"([_/@])(?=\w)", r"\1<wbr>", str(markupsafe.escape(text))))
 
 
 def _uri(svg: bytes) -> str:
@@ -97,7 +101,7 @@ def _file(name: str) -> str:
 
 
 @cache
-def _environment() -> Any:
+def _environment() -> Environment:
     import jinja2
 
     environment = jinja2.Environment(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from lerobot_roborecover.analysis.style import (
     LINE,
     SOFT,
     Figure,
+    Plot,
     Width,
     both,
     colour,
@@ -105,7 +105,7 @@ def detectable_figure(
     counts = np.unique(np.geomspace(10, 1000, 60).round().astype(int))
     lines = {k: [100 * detectable(guess, int(n), k, wanted, level, family) for n in counts] for k in trials}
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 4.2 if not width.narrow else 3.6)
             for i, (k, values) in enumerate(lines.items()):

@@ -74,18 +74,20 @@ def rank_agreement(
     products = np.array(shown[:total]) * np.array(shown[total:])
     same, other = int((products > 0).sum()), int((products < 0).sum())
     low, high = (2 * same / total - 1, 1 - 2 * other / total) if total else (float("nan"), float("nan"))
+    rho, tau = _coefficients(first, second)
     return RankAgreement(
         policies=len(names),
         inversions=Estimate(float(len(pairs)), float(other), float(total - same)),
         inverted=tuple((names[a], names[b]) for a, b in pairs),
         shown_same=same,
         shown_inverted=other,
-        rho=_coefficient(stats.spearmanr, first, second),
-        tau=Estimate(_coefficient(stats.kendalltau, first, second), low, high),
+        rho=rho,
+        tau=Estimate(tau, low, high),
     )
 
 
-def _coefficient(function, x: np.ndarray, y: np.ndarray) -> float:
+def _coefficients(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Spearman's and Kendall's; NaN where one of the orders is none."""
     if len(x) < 2 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return float("nan")
-    return float(function(x, y).statistic)
+        return float("nan"), float("nan")
+    return float(stats.spearmanr(x, y).statistic), float(stats.kendalltau(x, y).statistic)

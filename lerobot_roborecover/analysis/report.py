@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.page import grouped, picture, render_page
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.style import png_of, svg_of
-from lerobot_roborecover.analysis.tables import Table, to_csv, to_latex, to_markdown
+from lerobot_roborecover.analysis.tables import Cell, Table, to_csv, to_latex, to_markdown
 from lerobot_roborecover.analysis.units import ESTIMAND
 from lerobot_roborecover.whole import write_whole
 
@@ -171,14 +171,21 @@ def _as_json(
     }
 
 
-def _json_cell(cell: Any) -> Any:
+def _json_cell(cell: Cell) -> str | float | dict[str, Any] | None:
     """JSON has no NaN: null is "not defined"."""
     if isinstance(cell, Estimate):
         return {name: _json_cell(getattr(cell, name)) for name in ("value", "low", "high")}
     return None if isinstance(cell, float) and math.isnan(cell) else cell
 
 
-def _markdown(results, tables, images, remarks, provenance, extras: Extras) -> str:
+def _markdown(
+    results: Results,
+    tables: Sequence[Table],
+    images: Mapping[str, Mapping[str, str]],
+    remarks: Sequence[str],
+    provenance: Mapping[str, Any],
+    extras: Extras,
+) -> str:
     lines = [f"# {markdown(extras.title, cell=True)}", "", markdown(headline(results)), ""]
     lines += [f"- {markdown(remark)}" for remark in remarks] + [""] * bool(remarks)
     by_name = {table.name: table for table in tables}
@@ -195,7 +202,15 @@ def _fenced(text: str) -> str:
     return text.replace("```", "` ` `")
 
 
-def _html(results, tables, images, cards: list[Card], remarks, provenance, extras: Extras) -> str:
+def _html(
+    results: Results,
+    tables: Sequence[Table],
+    images: Mapping[str, Mapping[str, str]],
+    cards: list[Card],
+    remarks: Sequence[str],
+    provenance: Mapping[str, Any],
+    extras: Extras,
+) -> str:
     by_name = {table.name: table for table in tables}
     sections = [
         {

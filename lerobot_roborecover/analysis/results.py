@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -25,6 +25,7 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
+from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.units import WORDS, Unit
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
@@ -184,7 +185,7 @@ class Results:
         return watched_pair(panel, pair, level) if self.options.sequential else None
 
     @cached_property
-    def _records(self):
+    def _records(self) -> Mapping[tuple[str, str], SequentialRecord]:
         return recorded_pairs(self.study.sequential, self._direct)
 
     @cached_property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from lerobot_roborecover.analysis.style import (
     LINE,
     PAPER,
     Figure,
+    Plot,
     Width,
     both,
     colour,
@@ -108,7 +108,7 @@ def runs_figure(results: Results) -> Figure:
     )
     level = f"{100 * results.draws.level:g} % interval"
 
-    def draw(width: Width) -> Any:
+    def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 0.9 + row_height(width, 0.46) * len(order))
             for y, p in enumerate(order):

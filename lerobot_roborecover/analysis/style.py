@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING, Any
 from lerobot_roborecover.analysis.tables import NOT_DEFINED
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as _Plot
     from matplotlib.typing import RcKeyType
+
+type Plot = _Plot
+"""A matplotlib figure."""
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f5f00")
 """Okabe and Ito's palette, dark ones first."""
@@ -106,25 +111,26 @@ class Figure:
     title: str
     description: str
     """What it shows, in words, for readers who do not see it."""
-    plot: Any
-    narrow: Any = None
+    plot: Plot
+    narrow: Plot | None = None
     """The same for a phone; None where it is narrow enough already."""
 
 
-def both(draw: Callable[[Width], Any]) -> tuple[Any, Any]:
+def both(draw: Callable[[Width], Plot]) -> tuple[Plot, Plot]:
     """A drawing of either width."""
     return draw(WIDE), draw(NARROW)
 
 
 @contextmanager
-def drawing() -> Generator[Any]:
-    """matplotlib's `subplots` under the report's style, without a display."""
+def drawing() -> Generator[Callable[..., tuple[Plot, Any]]]:
+    """matplotlib's `subplots` under the report's style, without a display: of width and height in inches and
+    its own options, the figure and its axes, one or an array of them."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Plot
+    from matplotlib.figure import Figure as Canvas
 
-    def subplots(width: float, height: float, **kwargs: Any) -> tuple[Any, Any]:
-        plot = Plot(figsize=(width, height), layout="constrained")
+    def subplots(width: float, height: float, **kwargs: Any) -> tuple[Plot, Any]:
+        plot = Canvas(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(plot)
         return plot, plot.subplots(**kwargs)
 
@@ -132,7 +138,7 @@ def drawing() -> Generator[Any]:
         yield subplots
 
 
-def name_rows(axes: Any, names: Sequence[str], width: Width) -> None:
+def name_rows(axes: Axes, names: Sequence[str], width: Width) -> None:
     """Names of the rows y = 0, 1, ...: beside them, or above them where the figure is narrow."""
     if not width.narrow:
         axes.set_yticks(range(len(names)), names)
@@ -174,14 +180,14 @@ def number(value: float, spec: str = ".0f") -> str:
     return NOT_DEFINED if math.isnan(value) else format(value, spec)
 
 
-def _lay_out(plot: Any) -> None:
+def _lay_out(plot: Plot) -> None:
     """Makes room for the texts, once: every file of a drawing then has the same places."""
     if (engine := plot.get_layout_engine()) is not None:
         engine.execute(plot)
         plot.set_layout_engine("none")
 
 
-def svg_of(plot: Any) -> bytes:
+def svg_of(plot: Plot) -> bytes:
     """SVG of a plot, for light and dark pages; the same plot gives the same bytes.
 
     The file's own colours are the light ones, which every program shows; browsers with a dark screen take
@@ -206,7 +212,7 @@ def svg_of(plot: Any) -> bytes:
     return text[:end] + style + text[end:]
 
 
-def png_of(plot: Any) -> bytes:
+def png_of(plot: Plot) -> bytes:
     """PNG of a plot on white; the same plot gives the same bytes."""
     import io
 

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
@@ -134,7 +134,7 @@ class EpisodeWriter:
     def __init__(self, root: Path, fps: int, robot_type: str):
         quiet_video()
         self._root, self._fps, self._robot_type = root, fps, robot_type
-        self._dataset: Any = None
+        self._dataset: LeRobotDataset | None = None
         self._steps: list[int] = []
 
     def write(self, episode: Episode) -> None:
@@ -144,16 +144,16 @@ class EpisodeWriter:
             ScenarioError: it has not one frame before each action, or a camera's film another number of
                 frames than that.
         """
-        steps, written = len(episode.actions), 0
+        dataset, steps, written = self._dataset, len(episode.actions), 0
         for frame in episode.frames:
             if written == steps:
                 written += 1
                 break
-            if self._dataset is None:
-                self._dataset = self._create(episode, frame)
+            if dataset is None:
+                dataset = self._dataset = self._create(episode, frame)
             action = episode.actions[written]
             own = {k: np.array([v[written]], dtype=np.float32) for k, v in episode.columns.items()}
-            self._dataset.add_frame(
+            dataset.add_frame(
                 {
                     **frame,
                     "action": action.astype(np.float32),
@@ -164,16 +164,16 @@ class EpisodeWriter:
                 }
             )
             written += 1
-        if written != steps or not written:
+        if dataset is None or written != steps or not written:
             raise ScenarioError(
                 f"{episode.name}: {steps} actions, but {written if written <= steps else 'more'} frames; an "
                 "episode has one frame before each action, and at least one"
             )
-        self._dataset.save_episode()
-        self._check_latest(episode.name, steps)
+        dataset.save_episode()
+        self._check_latest(dataset.meta, episode.name, steps)
         self._steps.append(steps)
 
-    def _create(self, episode: Episode, frame: Frame) -> Any:
+    def _create(self, episode: Episode, frame: Frame) -> LeRobotDataset:
         features = features_of(frame, episode.actions.shape[1])
         features |= {k: {"dtype": "float32", "shape": (1,), "names": None} for k in episode.columns}
         dataset = LeRobotDataset.create(
@@ -196,10 +196,12 @@ class EpisodeWriter:
             )
         return dataset
 
-    def _check_latest(self, name: str, steps: int) -> None:
+    def _check_latest(self, meta: LeRobotDatasetMetadata, name: str, steps: int) -> None:
         """The length of the film just written, which is where LeRobot begins the next one."""
-        latest = self._dataset.meta.latest_episode
-        for camera in self._dataset.meta.video_keys:
+        latest = meta.latest_episode
+        for camera in meta.video_keys:
+            if latest is None:
+                raise ScenarioError(f"{name} (episode {len(self._steps)}): nothing of it was kept; {REMEDY}")
             begin, end = (latest[f"videos/{camera}/{part}_timestamp"][0] for part in ("from", "to"))
             frames = round((end - begin) * self._fps)
             if frames != steps:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_roborecover.scenario import ScenarioError
 
+if TYPE_CHECKING:
+    import h5py
+
 MAX_ARRAY_BYTES = 2**33
 
 
 @contextmanager
-def open_hdf5(path: Path) -> Generator[Any]:
+def open_hdf5(path: Path) -> Generator[h5py.File]:
     """An HDF5 file, opened for reading.
 
     Raises:
@@ -34,7 +37,7 @@ def open_hdf5(path: Path) -> Generator[Any]:
 
 
 def read_array(
-    group: Any,
+    group: h5py.Group,
     name: str,
     *,
     ndim: int | None = None,
@@ -86,7 +89,7 @@ def read_array(
     return values
 
 
-def episode_names(group: Any, prefix: str) -> list[str]:
+def episode_names(group: h5py.Group, prefix: str) -> list[str]:
     """Names like `demo_0`, in numeric order."""
     names = [n for n in group if n.startswith(prefix) and n[len(prefix) :].isdigit()]
     return sorted(names, key=lambda n: int(n[len(prefix) :]))

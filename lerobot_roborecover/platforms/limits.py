@@ -12,11 +12,9 @@ One that does not know them lacks the methods, and whoever asks learns so from `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-
-from lerobot_roborecover.platforms.simulator import Simulator
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,6 @@ class Limits(Protocol):
         """Of the current reset."""
 
 
-def limits_of(simulator: Simulator | Any) -> Limits | None:
+def limits_of(simulator: object) -> Limits | None:
     """The simulator's limits, or None where it knows none."""
     return simulator if isinstance(simulator, Limits) else None

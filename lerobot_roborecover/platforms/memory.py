@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import gc
 import sys
+from collections.abc import Callable
 
 
-def _find_trim():
+def _find_trim() -> Callable[[int], int] | None:
     if sys.platform != "linux":
         return None
     return getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's; musl has none

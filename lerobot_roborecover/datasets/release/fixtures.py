@@ -17,6 +17,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lerobot_roborecover.datasets.release.record import LIBERO_SEED
 from lerobot_roborecover.platforms.simulator import Simulator
@@ -103,7 +104,7 @@ def compare_fixtures(found: Mapping[str, Pose], said: Mapping[str, Pose], whose:
     return worst
 
 
-def angle_rad(found: Any, said: Any) -> float:
+def angle_rad(found: ArrayLike, said: ArrayLike) -> float:
     """Angle between two rotations given as quaternions of the same order."""
     a, b = (np.asarray(q, dtype=np.float64) for q in (found, said))
     a, b = a / max(float(np.linalg.norm(a)), 1e-12), b / max(float(np.linalg.norm(b)), 1e-12)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lerobot_roborecover.datasets.release.fixtures import angle_rad, check_fixtures
 from lerobot_roborecover.datasets.release.json_form import KEY
@@ -85,5 +86,5 @@ def _robotwin(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
     return found
 
 
-def _distance_mm(found: Any, said: Any) -> float:
+def _distance_mm(found: ArrayLike, said: ArrayLike) -> float:
     return float(np.linalg.norm(np.subtract(found, said))) * 1e3

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import LiberoEnv
 
 from lerobot_roborecover.errors import OptionError
@@ -33,7 +34,7 @@ class LiberoConfig(LiberoEnv, Filmed):
     robot, some six times as fast where there is no GPU. Other pictures, so another experiment for a policy
     that looks at them; the physics is the same."""
 
-    def processors_for(self, policy_cfg: Any) -> None:
+    def processors_for(self, policy_cfg: PreTrainedConfig) -> None:
         """LeRobot's choice is right here."""
 
     def __post_init__(self):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class _ArrayUnpickler(pickle.Unpickler):
         }
     )
 
-    def find_class(self, module: str, name: str):
+    def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._ALLOWED:
             raise pickle.UnpicklingError(f"{module}.{name} is not part of a numpy array")
         return super().find_class(module.replace("numpy.core", "numpy._core"), name)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import RoboTwinEnvConfig
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_roborecover.errors import OptionError
@@ -54,13 +54,15 @@ class RobotwinConfig(RoboTwinEnvConfig, Filmed):
             self.features[f"pixels/{MOSAIC}"] = picture
             self.features_map[f"pixels/{MOSAIC}"] = f"{OBS_IMAGES}.{MOSAIC}"
 
-    def processors_for(self, policy_cfg: Any) -> tuple[Any, Any]:
+    def processors_for(
+        self, policy_cfg: PreTrainedConfig
+    ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """X-VLA's own where it moves end effectors, the env type's otherwise."""
         if getattr(policy_cfg, "type", "") == "xvla" and self.action_mode == "ee":
             return xvla_processors()
         return self.get_env_processors()
 
-    def get_env_processors(self) -> tuple[Any, Any]:
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """The mosaic of cameras, where that is asked for."""
         return mosaic_processors() if self.mosaic else super().get_env_processors()
 

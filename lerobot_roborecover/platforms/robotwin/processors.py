@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStep
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import interpolate
+
+type Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 MOSAIC = "mosaic"
 """Name of the picture made of all three cameras."""
@@ -43,7 +46,7 @@ class CameraMosaicStep(ObservationProcessorStep):
         out[f"{OBS_IMAGES}.{MOSAIC}"] = torch.cat([head, torch.cat([left, right], dim=-1)], dim=-2)
         return out
 
-    def transform_features(self, features: Any) -> Any:
+    def transform_features(self, features: Features) -> Features:
         """LeRobot asks for it; features are declared by the env config."""
         return features
 
@@ -68,7 +71,7 @@ class XVLAStateStep(ObservationProcessorStep):
         out[OBS_STATE] = torch.from_numpy(np.concatenate(arms, axis=1)).float()
         return out
 
-    def transform_features(self, features: Any) -> Any:
+    def transform_features(self, features: Features) -> Features:
         """LeRobot asks for it; features are declared by the env config."""
         return features
 
@@ -103,7 +106,7 @@ class XVLAActionStep(ProcessorStep):
         out[TransitionKey.ACTION.value] = torch.from_numpy(np.concatenate(arms, axis=1))
         return out
 
-    def transform_features(self, features: Any) -> Any:
+    def transform_features(self, features: Features) -> Features:
         """LeRobot asks for it; features are declared by the env config."""
         return features
 
@@ -117,11 +120,11 @@ def _quaternions(columns: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=-1)).as_quat()
 
 
-def xvla_processors() -> tuple[Any, Any]:
+def xvla_processors() -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Env processors of an X-VLA that moves end effectors."""
     return PolicyProcessorPipeline(steps=[XVLAStateStep()]), PolicyProcessorPipeline(steps=[XVLAActionStep()])
 
 
-def mosaic_processors() -> tuple[Any, Any]:
+def mosaic_processors() -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Env processors of a policy that sees one picture of all cameras."""
     return PolicyProcessorPipeline(steps=[CameraMosaicStep()]), PolicyProcessorPipeline(steps=[])

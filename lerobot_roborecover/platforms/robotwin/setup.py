@@ -9,13 +9,19 @@ import os
 import sys
 from collections.abc import Generator
 from copy import deepcopy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from lerobot_roborecover.platforms.robotwin import stubs
 from lerobot_roborecover.platforms.robotwin.checkout import EMBODIMENT, RobotwinCheckout
 from lerobot_roborecover.platforms.simulator import SimulatorError
+
+if TYPE_CHECKING:
+    from sapien import Entity
+
+type TaskCode = Any
+"""A task of RoboTwin's own code, which has no types and is in nobody's environment."""
 
 _ARMS = "left_entity", "right_entity"
 
@@ -73,7 +79,7 @@ def setup_arguments(checkout: RobotwinCheckout, task: str, task_config: str) -> 
     return arguments
 
 
-def body_names(task: Any) -> dict[Any, str]:
+def body_names(task: TaskCode) -> dict[Entity, str]:
     """Movable entities and articulation links of the scene that are not the robot's, by a name of their own.
 
     Named as the task's code names them (`block1`), because RoboTwin's entity names repeat.
@@ -86,7 +92,7 @@ def body_names(task: Any) -> dict[Any, str]:
         if type(actor).__name__ in ("Entity", "PhysxArticulation"):
             attributes.setdefault(actor, attribute)
     physics = task.scene.physx_system
-    found: list[tuple[Any, str]] = []
+    found: list[tuple[Entity, str]] = []
     for component in physics.rigid_dynamic_components:
         if not getattr(component, "kinematic", False):
             found.append((component.entity, attributes.get(component.entity) or component.entity.name))
@@ -95,7 +101,7 @@ def body_names(task: Any) -> dict[Any, str]:
             continue
         owner = attributes.get(link.articulation) or link.articulation.name or "articulation"
         found.append((link.entity, f"{owner}.{link.name}"))
-    names: dict[Any, str] = {}
+    names: dict[Entity, str] = {}
     for entity, name in found:
         unique, copy = name or "body", 2
         while unique in names.values() or unique.startswith("eef"):
@@ -104,7 +110,7 @@ def body_names(task: Any) -> dict[Any, str]:
     return names
 
 
-def mend(task: Any, name: str) -> None:
+def mend(task: TaskCode, name: str) -> None:
     """Sets what `check_success` reads and only the scripted expert `play_once` would set.
 
     Each value is what the expert's first lines compute from the scene at rest; RoboTwin's own evaluation has

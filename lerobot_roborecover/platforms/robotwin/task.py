@@ -20,7 +20,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Generator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from lerobot_roborecover.platforms.robotwin import stubs
 from lerobot_roborecover.platforms.robotwin.checkout import EMBODIMENT, RobotwinCheckout
 from lerobot_roborecover.platforms.robotwin.random import RandomStreams
 from lerobot_roborecover.platforms.robotwin.setup import (
+    TaskCode,
     body_names,
     import_task,
     mend,
@@ -38,6 +39,9 @@ from lerobot_roborecover.platforms.robotwin.setup import (
 )
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Pose
+
+if TYPE_CHECKING:
+    from sapien import Entity
 
 ARM_JOINTS = 6
 _MISSING_ASSET = (FileNotFoundError, ValueError, TypeError, AttributeError, IndexError)
@@ -59,10 +63,12 @@ class RobotwinTask:
         self.checkout, self.name = checkout, name
         self._streams = RandomStreams()
         with working_in(checkout.root):
-            self.task: Any = import_task(checkout, name)()
-        self._names: dict[Any, str] = {}
+            self.task: TaskCode = import_task(checkout, name)()
+        self._names: dict[Entity, str] = {}
 
-    def setup(self, task_config: str, seed: int, instruction: str, scene: contextlib.AbstractContextManager):
+    def setup(
+        self, task_config: str, seed: int, instruction: str, scene: contextlib.AbstractContextManager
+    ) -> None:
         """Builds the scene of a seed.
 
         Args:
