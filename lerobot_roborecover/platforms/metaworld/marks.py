@@ -6,12 +6,15 @@ A body's centre of mass says neither: that of the basketball lies 0.6 m from the
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
 from lerobot_roborecover.scenario import Pose
+
+if TYPE_CHECKING:
+    from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 FINAL_OFFSET_M: Mapping[str, tuple[float, float, float]] = {
     "assembly-v3": (0.13, 0.0, 0.0),
@@ -28,7 +31,7 @@ _OBJECT, _GOAL = slice(4, 7), slice(36, 39)
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-def handled_body(env: Any, parts: Mapping[str, Iterable[int]], raw: np.ndarray) -> str | None:
+def handled_body(env: SawyerXYZEnv, parts: Mapping[str, Iterable[int]], raw: np.ndarray) -> str | None:
     """The body that Meta-World's observation is about: the one with a geom nearest to the observed point.
 
     Args:

@@ -25,6 +25,7 @@ import gymnasium as gym
 import metaworld
 import mujoco
 import numpy as np
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from lerobot_roborecover.platforms.limits import Workspace
 from lerobot_roborecover.platforms.metaworld.marks import handled_body, marks
@@ -96,8 +97,8 @@ class MetaworldSimulator:
             raise SimulatorError(f"obs_type {obs_type!r} is not one of {', '.join(OBS_TYPES)}")
         self._height, self._width = observation_height, observation_width
         self._camera, self._obs_type, self._fast = camera_name, obs_type, render_quality == "fast"
-        self._envs: OrderedDict[str, Any] = OrderedDict()
-        self._env: Any = None
+        self._envs: OrderedDict[str, SawyerXYZEnv] = OrderedDict()
+        self._env: SawyerXYZEnv | None = None
         self._first_attributes: dict[str, dict[str, Any]] = {}
         self._first_layouts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._raw = np.zeros(ENVIRONMENT_STATE_DIM)
@@ -105,7 +106,8 @@ class MetaworldSimulator:
         self._frame: np.ndarray | None = None
         self._tracked: dict[str, int] = {}
         self._parts: dict[str, set[int]] = {}
-        self._task_name, self._handled = "", None
+        self._task_name = ""
+        self._handled: str | None = None
         self._fingers: list[set[int]] = []
         spaces: dict[str, gym.Space[Any]] = {}
         if obs_type != "state":
@@ -281,12 +283,12 @@ class MetaworldSimulator:
         self._envs.clear()
         self._env = None
 
-    def _ready(self) -> Any:
+    def _ready(self) -> SawyerXYZEnv:
         if self._env is None:
             raise SimulatorError("the simulator was not reset yet (or is closed); call reset first")
         return self._env
 
-    def _env_of(self, name: str) -> Any:
+    def _env_of(self, name: str) -> SawyerXYZEnv:
         if name in self._envs:
             self._envs.move_to_end(name)
             return self._envs[name]
@@ -318,11 +320,11 @@ class MetaworldSimulator:
         return env
 
 
-def _attributes(env: Any) -> dict[str, Any]:
+def _attributes(env: SawyerXYZEnv) -> dict[str, Any]:
     return {name: getattr(env, name) for name in STEP_ATTRIBUTES if hasattr(env, name)}
 
 
-def _set_attributes(env: Any, values: Mapping[str, Any]) -> None:
+def _set_attributes(env: SawyerXYZEnv, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         setattr(env, name, value)
 
@@ -350,7 +352,7 @@ def _movable(model: mujoco.MjModel) -> dict[str, int]:
     return found
 
 
-def _render(env: Any) -> np.ndarray:
+def _render(env: SawyerXYZEnv) -> np.ndarray:
     if sys.platform.startswith("linux") and not (os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY")):
         os.environ["MUJOCO_GL"] = "egl"  # Gymnasium would take GLFW, which makes no context without a display
     try:
