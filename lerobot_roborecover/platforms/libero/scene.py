@@ -116,7 +116,7 @@ class LiberoScene:
         if region in self.env.obj_body_id:
             return float(self.cloud_m(region)[:, 2].max())
         parent = self.env.object_sites_dict[region].__dict__.get("parent_name")
-        if parent in self.env.obj_body_id and "contain" in region:
+        if isinstance(parent, str) and parent in self.env.obj_body_id and "contain" in region:
             return float(self.cloud_m(parent)[:, 2].max())
         return float(self.center_m(region)[2])
 

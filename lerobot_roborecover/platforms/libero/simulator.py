@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from functools import cached_property
 from importlib import metadata
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +19,9 @@ from lerobot_roborecover.platforms.limits import Workspace
 from lerobot_roborecover.platforms.memory import release_freed_memory
 from lerobot_roborecover.platforms.simulator import Observation, SimulatorError
 from lerobot_roborecover.scenario import Pose, Reset, Task
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.platforms.libero.robosuite_types import LiberoEnv
 
 CAMERA_NAMES = {"agentview_image": "image", "robot0_eye_in_hand_image": "image2"}
 """LeRobot's names of LIBERO's two cameras (lerobot/envs/libero.py)."""
@@ -248,7 +252,7 @@ class LiberoSimulator:
         self._clock = None
 
     @property
-    def libero_env(self):
+    def libero_env(self) -> LiberoEnv:
         """hf-libero's environment of the current task, for scripted experts that read privileged state."""
         self._require_reset()
         return self._task.env

@@ -16,6 +16,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -36,6 +37,9 @@ from lerobot_roborecover.platforms.mujoco_state import (
 )
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Pose
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.platforms.libero.robosuite_types import Arm, LiberoEnv
 
 _ENDLESS = 2**31 - 1
 """Horizon given to robosuite, which otherwise ends an episode after 1,000 steps whatever its outcome."""
@@ -92,7 +96,7 @@ class LiberoTask:
             raise SimulatorError(f"hf-libero has no {bddl}; install hf-libero==0.1.4")
         self.init_states = read_init_states(suite, name)
         with _numpy_random(None):
-            self.env = ControlEnv(
+            self.env: LiberoEnv = ControlEnv(
                 bddl_file_name=str(bddl),
                 use_camera_obs=False,
                 has_offscreen_renderer=False,
@@ -118,7 +122,7 @@ class LiberoTask:
         return self.env.sim.data._data
 
     @property
-    def robot(self):
+    def robot(self) -> Arm:
         """robosuite's single-arm robot."""
         return self.env.robots[0]
 
