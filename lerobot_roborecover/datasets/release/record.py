@@ -149,29 +149,29 @@ def to_scenario(
     )
 
 
-def _integer(value: Any) -> str:
+def _integer(value: object) -> str:
     return "" if type(value) is int and 0 <= value < 2**32 else "an integer from 0 to 2^32 - 1"
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return "" if isinstance(value, str) and 0 < len(value) <= 2000 else "text of 1 to 2000 characters"
 
 
-def _one_of(labels: type[StrEnum]) -> Callable[[Any], str]:
+def _one_of(labels: type[StrEnum]) -> Callable[[object], str]:
     wanted = f"one of {', '.join(labels)}"
     return lambda value: "" if value in tuple(labels) else wanted
 
 
-def _anything(value: Any) -> str:
+def _anything(value: object) -> str:
     return ""
 
 
-def _object(value: Any) -> str:
+def _object(value: object) -> str:
     return "" if isinstance(value, dict) else "an object"
 
 
-def _state(**widths: int) -> Callable[[Any], str]:
-    def check(value: Any) -> str:
+def _state(**widths: int) -> Callable[[object], str]:
+    def check(value: object) -> str:
         said = "an object of " + ", ".join(f"{k}[{n}]" if n else k for k, n in widths.items())
         if not isinstance(value, dict) or set(value) != set(widths):
             return said
@@ -186,7 +186,7 @@ def _state(**widths: int) -> Callable[[Any], str]:
     return check
 
 
-_COMMON: dict[str, Callable[[Any], str]] = {
+_COMMON: dict[str, Callable[[object], str]] = {
     "task_description": _text,
     "episode_idx": _integer,
     "seed": _integer,
@@ -198,7 +198,7 @@ _COMMON: dict[str, Callable[[Any], str]] = {
     "annotated_step": _integer,
     "actions": _anything,
 }
-_FIELDS: dict[str, dict[str, Callable[[Any], str]]] = {
+_FIELDS: dict[str, dict[str, Callable[[object], str]]] = {
     "libero": {
         **_COMMON,
         "model_name": _text,
@@ -242,7 +242,7 @@ def _check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) ->
             raise ScenarioError(f"field {name}: {record[name]!r:.80} is not {wanted}")
 
 
-def _actions(value: Any) -> tuple[np.ndarray, str]:
+def _actions(value: object) -> tuple[np.ndarray, str]:
     """The actions, (N, A) float64, and in hex one bit a number: it was written as an integer."""
     if not isinstance(value, list) or not value or not all(isinstance(row, list) for row in value):
         raise ScenarioError(f"field actions: {value!r:.80} is not a list of actions, each a list of numbers")

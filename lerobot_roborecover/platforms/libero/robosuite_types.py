@@ -1,7 +1,7 @@
 """What this package uses of robosuite 1.4 and hf-libero, which say nothing of their types.
 
-Their own classes begin most attributes as None and fill them at the first reset; here they are as after it. For
-the type checker alone: nothing of this is looked at when the code runs.
+Their own classes begin most attributes as None and fill them at the first reset; here they are as after it.
+For the type checker alone: nothing of this is looked at when the code runs.
 """
 
 from __future__ import annotations
