@@ -34,6 +34,7 @@ from lerobot_roborecover.workers.messages import (
     ActResult,
     EpisodeSpec,
     EpisodeStart,
+    Reply,
     RollbackResult,
     SlotFailure,
     StepResult,
@@ -120,7 +121,7 @@ class Trial:
         self._sim_s = self._policy_s = 0.0
         self._executed = hashlib.sha256()
         self._record = InterventionRecord()
-        self._sent: Sequence[np.ndarray] = ()
+        self._sent = np.empty((0, action_width))
         self._directives: Sequence[Directive] = ()
 
     @property
@@ -210,7 +211,7 @@ class Trial:
         self._policy_s += seconds
         self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {why}")
 
-    def take(self, reply: EpisodeStart | StepResult | ActResult | RollbackResult | SlotFailure) -> None:
+    def take(self, reply: Reply) -> None:
         """Takes the simulator's reply in."""
         if isinstance(reply, SlotFailure):
             self._leave(*IN_SIMULATOR, to=TrialState.OVER)
@@ -228,9 +229,11 @@ class Trial:
             self.observation = reply.observation
             if reply.solved:
                 self._end(Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
-        else:
+        elif isinstance(reply, StepResult | ActResult):
             self._leave(TrialState.ACTING, to=TrialState.WAITING)
             self._acted(reply)
+        else:
+            raise TypeError(f"{self}: a {type(reply).__name__} is no reply to a command of a trial")
 
     def fail(self, outcome: Outcome, reason: str) -> None:
         """Ends it wherever it is, for a reason from outside."""
@@ -247,6 +250,16 @@ class Trial:
         self._leave(TrialState.NEW, to=TrialState.OVER)
         self.success, self.steps = success, steps
 
+    def verdict(self) -> Outcome:
+        """How it ended.
+
+        Raises:
+            RuntimeError: it is not over, or was skipped.
+        """
+        if self.outcome is None:
+            raise RuntimeError(f"{self} has no outcome yet")
+        return self.outcome
+
     def row(self, *, dataset: str, dataset_revision: str | None, noise: str, batch_size: int) -> TrialRow:
         """Its row.
 
@@ -259,8 +272,6 @@ class Trial:
         Raises:
             RuntimeError: it is not over, or was skipped.
         """
-        if self.outcome is None:
-            raise RuntimeError(f"{self} has no outcome yet")
         return make_row(
             self.scenario,
             self.protocol,
@@ -269,7 +280,7 @@ class Trial:
             trial=self.index,
             noise=noise,
             batch_size=batch_size,
-            outcome=self.outcome,
+            outcome=self.verdict(),
             reason=self.reason,
             steps=self.steps,
             handoff=self.handoff,

@@ -22,7 +22,7 @@ from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.env.trial_log import TrialRow, trial_key
 from lerobot_roborecover.policies.host import PolicyError, Replica, ReplicaLostError
 from lerobot_roborecover.scenario import Outcome, Scenario
-from lerobot_roborecover.trials.seat import Seat
+from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackResult, SlotFailure
@@ -39,6 +39,8 @@ _POLL_S = 0.5
 
 type Waiter = Callable[[list[Any], float], Collection[Any]]
 """Waits for any of some handles, at most so many seconds; those that are ready."""
+type Event = tuple[Replica | EngineSlot, Callable[[], None]]
+"""Whom to wait for, and what to do then."""
 
 
 class Engine:
@@ -46,8 +48,7 @@ class Engine:
 
     Args:
         run: protocol (with its run seed), trial log.
-        slots: where simulators live: `send`, `receive`, `ready`, `deadline`, and `opening` and `opened` as
-            `host.Replica` has them.
+        slots: where simulators live.
         replicas: the policies.
         wait: how to wait for slots and replicas.
         batch_delay_s: how long a waiting slot may wait for company before the policy is asked, at least;
@@ -61,7 +62,7 @@ class Engine:
     def __init__(
         self,
         run: Run,
-        slots: Sequence[Any],
+        slots: Sequence[EngineSlot],
         replicas: Sequence[Replica],
         wait: Waiter,
         *,
@@ -75,7 +76,7 @@ class Engine:
         self._run, self._replicas, self._wait = run, list(replicas), wait
         self._delay_s, self._on_row, self._videos = batch_delay_s, on_row, videos
         self._seats = [Seat(slot) for slot in slots]
-        self._asked: dict[Replica, tuple[list[Seat], float]] = {}
+        self._asked: dict[Replica, tuple[list[Sitting], float]] = {}
         self._inference_s = {r: deque[float](maxlen=8) for r in self._replicas}
         self._failures: dict[str, int] = {}
         self._losses: dict[tuple[str, int], int] = {}
@@ -84,7 +85,7 @@ class Engine:
         self.reruns = 0
         """Trials that were begun again because a machine was lost."""
 
-    def run(self, units: list[Unit], stop: Callable[[], bool] = lambda: False) -> int:
+    def run(self, units: Sequence[Unit[Scenario]], stop: Callable[[], bool] = lambda: False) -> int:
         """Runs all units that the log does not hold yet.
 
         Args:
@@ -105,40 +106,46 @@ class Engine:
             if not events:
                 break
             self._collect(events, _POLL_S)
-        for seat in self._seats:
-            if seat.recording is not None:
-                seat.recording.drop()
+        for sitting in self._sittings():
+            if sitting.recording is not None:
+                sitting.recording.drop()
         return self._finished
+
+    def _sittings(self) -> list[Sitting]:
+        """The trials under way, in the order of their seats."""
+        return [s.sitting for s in self._seats if s.sitting is not None]
 
     # --- events
 
     def _fill(self) -> None:
         """Gives the next units to the seats without one."""
         for seat in self._seats:
-            while seat.trial is None and not seat.slot.opening and len(self._queue):
-                replica = self._least_busy()
-                if replica is None:
-                    return
-                self._start(seat, replica)
+            if seat.sitting is not None or seat.slot.opening:
+                continue
+            replica = self._least_busy()
+            if replica is None:
+                return
+            unit = self._queue.take(seat.last, [s.unit.task for s in self._sittings()])
+            if unit is None:
+                return
+            self._start(seat, unit, replica)
 
     def _least_busy(self) -> Replica | None:
-        users = [s.replica for s in self._seats]
+        users = [s.replica for s in self._sittings()]
         return min((r for r in self._replicas if not r.opening), key=users.count, default=None)
 
-    def _start(self, seat: Seat, replica: Replica) -> None:
-        unit = self._queue.take(seat.last, [s.unit.task for s in self._seats if s.unit is not None])
-        seat.unit = seat.last = unit
-        seat.trial = self._run.trial(unit.scenario, unit.trial)
-        seat.replica = replica
-        seat.history = replica.host.start(seat.trial.seed)
+    def _start(self, seat: Seat, unit: Unit[Scenario], replica: Replica) -> None:
+        trial = self._run.trial(unit.scenario, unit.trial)
+        seat.last = unit
+        seat.sitting = Sitting(seat, unit, trial, replica, replica.host.start(trial.seed))
         filmed = self._videos is not None and self._videos.wants(unit)
-        seat.slot.send("reset", seat.trial.begin(filmed))
+        seat.slot.send("reset", trial.begin(filmed))
 
     def _ask(self, replica: Replica) -> bool:
-        """Asks a free replica about the seats that wait for it, unless more company is to be expected."""
+        """Asks a free replica about the trials that wait for it, unless more company is to be expected."""
         if replica.opening or replica in self._asked:
             return False
-        mine = [s for s in self._seats if s.replica is replica]
+        mine = [s for s in self._sittings() if s.replica is replica]
         waiting = [s for s in mine if s.waiting]
         if not waiting:
             return False
@@ -148,12 +155,12 @@ class Engine:
         overdue = self._clock() - min(s.waiting_since for s in waiting) >= self._delay(replica)
         if company and not enough and not overdue:
             return False
-        seats = sorted(waiting, key=lambda s: s.waiting_since)[:limit]
-        self._asked[replica] = seats, self._clock()
+        asking = sorted(waiting, key=lambda s: s.waiting_since)[:limit]
+        self._asked[replica] = asking, self._clock()
         replica.ask(
-            [s.trial.ask() for s in seats],
-            [s.unit.scenario.task.instruction for s in seats],
-            [s.history for s in seats],
+            [s.trial.ask() for s in asking],
+            [s.unit.scenario.task.instruction for s in asking],
+            [s.history for s in asking],
         )
         return True
 
@@ -163,17 +170,17 @@ class Engine:
         usual_s = min(self._inference_s[replica], default=0.0)
         return max(self._delay_s, min(PATIENCE * usual_s, _MOST_PATIENT_S))
 
-    def _events(self) -> list[tuple[Any, Callable[[], None]]]:
-        """What can happen next: whom to wait for, and what to do then."""
-        events: list[tuple[Any, Callable[[], None]]] = []
+    def _events(self) -> list[Event]:
+        """What can happen next."""
+        events: list[Event] = []
         events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
-        events += [(s.slot, lambda s=s: self._replied(s)) for s in self._seats if s.working]
+        events += [(s.seat.slot, lambda s=s: self._replied(s)) for s in self._sittings() if s.working]
         if len(self._queue):
             parties = [*self._replicas, *(s.slot for s in self._seats)]
             events += [(p, p.opened) for p in parties if p.opening]
         return events
 
-    def _collect(self, events: list[tuple[Any, Callable[[], None]]], timeout_s: float) -> bool:
+    def _collect(self, events: list[Event], timeout_s: float) -> bool:
         """Handles the events that are there, or come until the first of them, a deadline, or the end of the
         batch delay.
 
@@ -193,15 +200,14 @@ class Engine:
             act()
         return bool(arrived or inline)
 
-    def _arrived(
-        self, events: list[tuple[Any, Callable[[], None]]], timeout_s: float
-    ) -> list[tuple[Any, Callable[[], None]]]:
+    def _arrived(self, events: list[Event], timeout_s: float) -> list[Event]:
         now = self._clock()
         deadline = min(getattr(party, "deadline", float("inf")) for party, _ in events)
         timeout_s = min(timeout_s, deadline - now)
-        for seat in self._seats:
-            if seat.waiting and seat.replica is not None and seat.replica not in self._asked:
-                timeout_s = min(timeout_s, self._delay(seat.replica) - (now - seat.waiting_since))
+        for sitting in self._sittings():
+            replica = sitting.replica
+            if sitting.waiting and replica is not None and replica not in self._asked:
+                timeout_s = min(timeout_s, self._delay(replica) - (now - sitting.waiting_since))
         ready = set(map(id, self._wait([p.ready for p, _ in events], max(timeout_s, 0.0))))
         now = self._clock()
         return [
@@ -211,85 +217,88 @@ class Engine:
         ]
 
     def _answered(self, replica: Replica) -> None:
-        seats, began = self._asked.pop(replica)
+        asked, began = self._asked.pop(replica)
         try:
             chunks = replica.answer()
         except ReplicaLostError as err:
-            for seat in self._seats:
-                if seat.replica is replica:
-                    seat.replica = None
-                    if not seat.working:  # one that works is given up when its slot has replied
-                        self._lost(seat, str(err))
+            for sitting in self._sittings():
+                if sitting.replica is replica:
+                    sitting.replica = None
+                    if not sitting.working:  # one that works is given up when its slot has replied
+                        self._lost(sitting, str(err))
             return
         seconds = self._clock() - began
         self._inference_s[replica].append(seconds)
-        for seat, chunk in zip(seats, chunks, strict=True):
+        for sitting, chunk in zip(asked, chunks, strict=True):
+            trial, slot = sitting.trial, sitting.seat.slot
             if isinstance(chunk, PolicyError):
-                seat.trial.refused(chunk, seconds=seconds)
+                trial.refused(chunk, seconds=seconds)
             else:
-                actions, directives = split(chunk, self._run.action_width(seat.unit.scenario))
-                move = seat.trial.decide(actions, directives, seconds=seconds)
-                if move is not None:
-                    act = isinstance(move, Act)
-                    seat.slot.send(*(("act", move.actions) if act else ("rollback", move.steps)))
-                    continue
-            self._finish(seat)
+                actions, directives = split(chunk, self._run.action_width(sitting.unit.scenario))
+                move = trial.decide(actions, directives, seconds=seconds)
+                if isinstance(move, Act):
+                    slot.send("act", move.actions)
+                elif move is not None:
+                    slot.send("rollback", move.steps)
+            if trial.over:
+                self._finish(sitting)
 
-    def _replied(self, seat: Seat) -> None:
-        reply = seat.slot.receive()
-        seat.waiting_since = self._clock()
-        if seat.replica is None:
-            self._lost(seat, "the policy's process was lost")
+    def _replied(self, sitting: Sitting) -> None:
+        reply = sitting.seat.slot.receive()
+        sitting.waiting_since = self._clock()
+        if sitting.replica is None:
+            self._lost(sitting, "the policy's process was lost")
             return
         if isinstance(reply, SlotFailure) and reply.kind == "lost":
-            self._lost(seat, reply.message)
+            self._lost(sitting, reply.message)
             return
-        seat.trial.take(reply)
-        if isinstance(reply, EpisodeStart) and reply.frame is not None:
-            seat.recording = self._videos.begin(seat.unit, reply.frame, reply.hz)
-        elif seat.recording is not None and isinstance(reply, ActResult):
-            seat.recording.add(reply.frames)
-        elif seat.recording is not None and isinstance(reply, RollbackResult):
-            seat.recording.add((reply.frame,))
-        if seat.trial.over:
-            self._finish(seat)
+        sitting.trial.take(reply)
+        if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
+            sitting.recording = self._videos.begin(sitting.unit, reply.frame, reply.hz)
+        elif sitting.recording is not None and isinstance(reply, ActResult):
+            sitting.recording.add(reply.frames)
+        elif sitting.recording is not None and isinstance(reply, RollbackResult) and reply.frame is not None:
+            sitting.recording.add((reply.frame,))
+        if sitting.trial.over:
+            self._finish(sitting)
 
     # --- ends
 
-    def _lost(self, seat: Seat, reason: str) -> None:
+    def _lost(self, sitting: Sitting, reason: str) -> None:
         """The trial's machine is gone: it is run again from its start, elsewhere."""
-        key = (seat.unit.scenario.id, seat.unit.trial)
+        key = (sitting.unit.scenario.id, sitting.unit.trial)
         self._losses[key] = self._losses.get(key, 0) + 1
         if self._losses[key] >= PARK_AFTER:
-            seat.trial.fail(Outcome.SIM_ERROR, f"lost {PARK_AFTER} times, last: {reason}")
-            self._finish(seat)
+            sitting.trial.fail(Outcome.SIM_ERROR, f"lost {PARK_AFTER} times, last: {reason}")
+            self._finish(sitting)
             return
         self.reruns += 1
-        self._queue.put_back(seat.unit)
-        self._leave(seat)
+        self._queue.put_back(sitting.unit)
+        self._leave(sitting)
 
-    def _finish(self, seat: Seat) -> None:
-        unit, trial = seat.unit, seat.trial
-        if seat.recording is not None:
-            self._videos.finish(seat.recording, unit, trial.outcome)
-            seat.recording = None
-        self._record(trial, seat.replica or self._replicas[0])
-        self._leave(seat)
-        broke = trial.outcome in (Outcome.SIM_ERROR, Outcome.TIMEOUT)
+    def _finish(self, sitting: Sitting) -> None:
+        unit, trial = sitting.unit, sitting.trial
+        outcome = trial.verdict()
+        if self._videos is not None and sitting.recording is not None:
+            self._videos.finish(sitting.recording, unit, outcome)
+            sitting.recording = None
+        self._record(trial, sitting.replica or self._replicas[0])
+        self._leave(sitting)
+        broke = outcome in (Outcome.SIM_ERROR, Outcome.TIMEOUT)
         count = self._failures[unit.scenario.id] = self._failures.get(unit.scenario.id, 0) + 1 if broke else 0
         if count >= PARK_AFTER:
             for other in self._queue.drop(unit.scenario.id):
                 parked = self._run.trial(other.scenario, other.trial)
                 text = f"not tried: the scenario failed {count} times in a row, last {trial.reason}"
-                parked.fail(trial.outcome, text)
+                parked.fail(outcome, text)
                 self._record(parked, self._replicas[0])
 
-    def _leave(self, seat: Seat) -> None:
-        if seat.replica is not None:
-            seat.replica.host.finish(seat.history)
-        if seat.recording is not None:
-            seat.recording.drop()
-        seat.unit = seat.trial = seat.replica = seat.history = seat.recording = None
+    def _leave(self, sitting: Sitting) -> None:
+        if sitting.replica is not None:
+            sitting.replica.host.finish(sitting.history)
+        if sitting.recording is not None:
+            sitting.recording.drop()
+        sitting.seat.sitting = None
 
     def _record(self, trial: Trial, replica: Replica) -> None:
         host = replica.host
@@ -299,7 +308,7 @@ class Engine:
         self._on_row(row)
 
 
-def unfinished(run: Run, units: Sequence[Unit]) -> list[Unit]:
+def unfinished(run: Run, units: Sequence[Unit[Scenario]]) -> list[Unit[Scenario]]:
     """Units that the run's trial log does not hold yet."""
     if run.log is None:
         return list(units)
@@ -308,6 +317,6 @@ def unfinished(run: Run, units: Sequence[Unit]) -> list[Unit]:
     return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
 
 
-def units_of(scenarios: Sequence[Scenario], trials: int) -> list[Unit]:
+def units_of(scenarios: Sequence[Scenario], trials: int) -> list[Unit[Scenario]]:
     """All trials of all scenarios."""
     return [Unit(s, k) for s in scenarios for k in range(trials)]

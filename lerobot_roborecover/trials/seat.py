@@ -1,37 +1,74 @@
-"""A seat of the engine: a slot, and the trial it runs."""
+"""A seat of the engine: a slot, and the trial that sits in it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from lerobot_roborecover.env.trial import Trial, TrialState
 from lerobot_roborecover.policies.host import Replica
+from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials.units import Unit
 from lerobot_roborecover.trials.videos import Recording
+from lerobot_roborecover.workers.messages import Reply
+
+
+class EngineSlot(Protocol):
+    """Where a simulator lives: `opening`, `ready` and `opened` as `host.Replica` has them."""
+
+    @property
+    def opening(self) -> bool:
+        """Whether it cannot be asked yet."""
+
+    @property
+    def ready(self) -> Any:
+        """What the engine's wait function waits on for the reply; True where it is there already."""
+
+    @property
+    def deadline(self) -> float:
+        """When the command under way counts as hung, on the engine's clock."""
+
+    def opened(self) -> None:
+        """Finds out whether the opening has worked."""
+
+    def send(self, command: str, argument: Any = None) -> None:
+        """Starts a command."""
+
+    def receive(self) -> Reply:
+        """Its reply."""
 
 
 @dataclass(eq=False)
 class Seat:
-    """A slot and the trial it runs; idle where it runs none."""
+    """A slot and who sits there."""
 
-    slot: Any
-    unit: Unit | None = None
-    trial: Trial | None = None
+    slot: EngineSlot
+    last: Unit[Scenario] | None = None
+    """Who sat there last, or sits there."""
+    sitting: Sitting | None = None
+    """None where it is idle."""
+
+
+@dataclass(eq=False)
+class Sitting:
+    """A trial in its seat."""
+
+    seat: Seat
+    unit: Unit[Scenario]
+    trial: Trial
     """Of `unit`."""
-    last: Unit | None = None
-    replica: Replica | None = None
+    replica: Replica | None
     """Who has the trial's history; None once that is lost."""
-    history: Any = None
+    history: Any
     waiting_since: float = 0.0
     recording: Recording | None = None
 
     @property
     def working(self) -> bool:
         """Whether its slot owes a reply."""
-        return self.trial is not None and self.trial.in_simulator
+        return self.trial.in_simulator
 
     @property
     def waiting(self) -> bool:
         """Whether the policy is to be asked about it."""
-        return self.trial is not None and self.trial.state is TrialState.WAITING
+        return self.trial.state is TrialState.WAITING

@@ -106,6 +106,9 @@ class WorkerSlot:
         assert self._connection is not None
         return self._connection
 
+    def opened(self) -> None:
+        """Nothing to find out."""
+
     @property
     def pid(self) -> int:
         """Process id of the current worker."""
