@@ -183,7 +183,7 @@ def interval_parts(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _rate(values: np.ndarray) -> Estimate:
     found = spread(values)
-    return Estimate(found.value, *rate_interval(found))
+    return Estimate(float(found.value), *(float(v) for v in rate_interval(found)))
 
 
 def coefficient(terms: np.ndarray, parts: Parts, largest: float | None = 1.0) -> Estimate:

@@ -24,6 +24,7 @@ DECISIONS_FILE = "decisions.jsonl"
 SCHEMA_VERSION = 1
 
 type StageName = Literal["collect", "annotate", "screen", "validate", "split"]
+type VerdictName = Literal["kept", "dropped", "undecided"]
 STAGES: tuple[str, ...] = get_args(StageName.__value__)
 """In the order of the paper's pipeline; collect stands for every way a trajectory comes in."""
 
@@ -35,7 +36,7 @@ class Decision:
     candidate: str
     """Its id, which is also that of the scenario made from it."""
     stage: StageName
-    verdict: Literal["kept", "dropped", "undecided"]
+    verdict: VerdictName
     reason: str = ""
     """A few words that many candidates share: a row of the funnel."""
     detail: str = ""

@@ -221,6 +221,11 @@ class CandidateSet:
         )
 
 
+def _candidate(fields: Mapping[str, Any], suggestions: tuple[Suggestion, ...]) -> Candidate:
+    whole: dict[str, Any] = {**fields, "suggestions": suggestions}
+    return Candidate(**whole)
+
+
 def read_candidates(root: str | os.PathLike[str], *, videos: bool = True) -> CandidateSet:
     """Reads and checks a candidate dataset's own metadata; trusts nothing in it.
 
@@ -248,8 +253,7 @@ def read_candidates(root: str | os.PathLike[str], *, videos: bool = True) -> Can
                 "pip install -U lerobot_env_roborecover"
             )
         candidates = tuple(
-            Candidate(**{**c, "suggestions": tuple(Suggestion(**s) for s in c["suggestions"])})
-            for c in found["candidates"]
+            _candidate(c, tuple(Suggestion(**s) for s in c["suggestions"])) for c in found["candidates"]
         )
         versions = {str(k): str(v) for k, v in found["versions"].items()}
     except ScenarioError as err:

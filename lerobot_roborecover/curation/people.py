@@ -200,12 +200,13 @@ def _without_vote(record: Mapping[str, Any], names: Mapping[str, str]) -> dict[s
 
 
 def _without_decider(record: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    deciders = _deciders(record["by"], record["reason"])
-    if not deciders:
+    if not _deciders(record["by"], record["reason"]):
         return dict(record)
     if record["reason"] == INSPECTION:
         return {**record, "by": names[record["by"]], "detail": "", "at": ""}
     match = _VOTES_OF.fullmatch(record["by"])
+    if match is None:
+        return dict(record)
     voters = sorted(names.get(n, n) for n in match.group(2).split(", "))
     return {**record, "by": f"{match.group(1)} of {', '.join(voters)}", "at": ""}
 

@@ -11,18 +11,21 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial_log import TrialLog, TrialRow, read_trial_log, trial_key
+from lerobot_roborecover.env.trial_log import Finished, RowLog, TrialRow, read_trial_log, trial_key
 from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.local import LocalEngine
 from lerobot_roborecover.whole import new_file
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.env.configs import RecoveryEnvConfig
 
 TRIALS_FILE = "trials.jsonl"
 ACTIONS_FOLDER = "actions"
@@ -81,7 +84,8 @@ class RecordingHost:
         Raises:
             ScenarioError: they are not those whose hash the row holds.
         """
-        chunks = self._chunks.get(row.trial_seed) if row.steps else None
+        known = row.steps and row.trial_seed is not None
+        chunks = self._chunks.get(row.trial_seed) if known else None
         if not chunks:
             return None
         actions = np.concatenate(chunks)[: row.steps]
@@ -95,7 +99,7 @@ class RecordingHost:
 class _KeepingLog:
     """A trial log that puts the actions on disk before the row, so that no row is without them."""
 
-    def __init__(self, log: TrialLog, host: RecordingHost, folder: Path):
+    def __init__(self, log: RowLog, host: RecordingHost, folder: Path):
         self._log, self._host, self._folder = log, host, folder
         self.path = log.path
 
@@ -103,7 +107,7 @@ class _KeepingLog:
     def rows(self) -> list[TrialRow]:
         return self._log.rows
 
-    def find(self, key: tuple) -> TrialRow | None:
+    def find(self, key: tuple) -> Finished | None:
         return self._log.find(key)
 
     def append(self, row: TrialRow) -> None:
@@ -116,7 +120,7 @@ class _KeepingLog:
 
 def run_trials(
     policy: str,
-    env: Any,
+    env: RecoveryEnvConfig,
     folder: Path,
     *,
     trials: int = 1,
@@ -155,18 +159,19 @@ def run_trials(
     facts = facts_of(config, n_episodes=trials)
     env.trial_log = str(folder / TRIALS_FILE)
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
+    log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=seed)
     units = units_of(sorted(scenarios, key=lambda s: s.id), trials)
     hash_ = run.protocol.config_hash()
     keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
     run.pool.acquire()
     try:
-        todo = [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
+        todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
             host = RecordingHost(
                 load.load_host(load.HostSpec(config, env, rename_map or {}, seed, max_batch))
             )
-            run.log = _KeepingLog(run.log, host, folder / ACTIONS_FOLDER)
+            run.log = _KeepingLog(log, host, folder / ACTIONS_FOLDER)
             count = [len(units) - len(todo)]
 
             def told(row: TrialRow) -> None:
@@ -175,7 +180,7 @@ def run_trials(
 
             workers = min(slots or os.cpu_count() or 1, len(todo))
             LocalEngine(run, host, slots=workers, on_row=told).run(todo)
-        rows = {r.key(): r for r in run.log.rows}
+        rows = {r.key(): r for r in log.rows}
     finally:
         run.pool.release()
     return [_with_actions(rows[key], folder / ACTIONS_FOLDER) for key in keys if key in rows]
@@ -190,7 +195,7 @@ def read_trials(folder: Path) -> list[PolicyTrial]:
     return [_with_actions(row, folder / ACTIONS_FOLDER) for row in read_trial_log(folder / TRIALS_FILE)]
 
 
-def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> Any:
+def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> RecoveryEnvConfig:
     """A recovery env config.
 
     Args:

@@ -33,7 +33,7 @@ from lerobot_roborecover.curation.attrition import (
 )
 from lerobot_roborecover.curation.candidates import CandidateSet
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.scenario import DeviationType, Scenario, ScenarioError, Stage
 
 NOT_PEOPLES = {
     "people": "",
@@ -223,8 +223,8 @@ def scenarios_of(
         candidates.scenario(
             r.candidate,
             r.step or 0,
-            r.stage,
-            r.deviation,
+            Stage(r.stage),
+            DeviationType(r.deviation),
             {
                 "annotation": {
                     "kind": label_kind(v.annotator for v in r.votes),

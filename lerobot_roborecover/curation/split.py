@@ -289,6 +289,8 @@ def _programme(
     low = [available, np.full(count * splits, -np.inf), np.floor(expected.ravel() + 1e-9)]
     high = [available, np.ceil(expected.ravel() - 1e-9), np.full(count * splits, np.inf)]
     if exactly is not None:
+        if sizes is None:
+            raise ValueError("exactly: needs sizes")
         rows.append([kron(sizes[None, :], eye_array(splits)), None])
         low.append(exactly)
         high.append(exactly)

@@ -56,14 +56,14 @@ def write_stage(
     document = {
         "schema_version": 1, "written_by": {"lerobot_env_roborecover": __version__}, **content,
     }  # fmt: skip
-    frames = FrameStore(source) if source else {}
+    frames = FrameStore(source) if source else None
     with new_folder(out) as folder:
         write_scenarios(
             folder,
             scenarios,
             description=manifest.get("description", ""),
             license=manifest.get("license"),
-            frames=(frames.of(s) for s in scenarios if s.id in frames),
+            frames=() if frames is None else (frames.of(s) for s in scenarios if s.id in frames),
         )
         if source:
             carry_decisions(source, folder)

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
 from lerobot.configs import FeatureType
 from lerobot.envs.configs import EnvConfig
 
@@ -19,18 +18,29 @@ from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.pipeline import callers_facts
 from lerobot_roborecover.env.processors import choose_processors_in_scripts
 from lerobot_roborecover.env.run import PlatformPart
-from lerobot_roborecover.env.vector_env import create_recovery_envs
+from lerobot_roborecover.env.vector_env import ScenarioVectorEnv, create_recovery_envs
 from lerobot_roborecover.platforms import Platform, all_platforms, platform_named
-from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup
 from lerobot_roborecover.workers.messages import SlotConfig
 
 _LOG = logging.getLogger(__name__)
 
 
+if TYPE_CHECKING:
+
+    class _PlatformsOwn(EnvConfig):
+        """What the platform's config, which is the other base of every env type, is sure to have."""
+
+        obs_type: str
+
+        def simulator_setup(self) -> SimulatorSetup: ...
+else:
+    _PlatformsOwn = object  # a base here would put its fields' defaults before the platform's
+
+
 @dataclass
-class RecoveryEnvConfig(RecoveryOptions):
-    """What all recovery env types share. Comes before the platform's own config, which has
-    `simulator_setup`."""
+class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
+    """What all recovery env types share. Comes before the platform's own config."""
 
     max_parallel_tasks: int = 1
     """Must stay 1."""
@@ -67,9 +77,9 @@ class RecoveryEnvConfig(RecoveryOptions):
         )
         return PlatformPart(slot, setup.decisive, setup.picture, setup.assets)
 
-    def create_envs(
+    def create_envs(  # ty: ignore[incompatible-method-override] LeRobot names tasks by number, but asks nowhere
         self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[str, gym.vector.VectorEnv]]:
+    ) -> dict[str, dict[str, ScenarioVectorEnv]]:
         """`{group: {scenario id: vector env}}`; raises what `run_spec` and `env.run.open_run` raise."""
         choose_processors_in_scripts()
         return create_recovery_envs(
@@ -77,7 +87,7 @@ class RecoveryEnvConfig(RecoveryOptions):
         )
 
 
-def _env_type(platform: Platform) -> type[EnvConfig]:
+def _env_type(platform: Platform) -> type[RecoveryEnvConfig]:
     base = platform.env_config()
     name = f"RoboRecover{platform.name.capitalize()}Env"
     members = {"__module__": __name__, "__doc__": base.__doc__, "platform_name": platform.name}
@@ -85,7 +95,7 @@ def _env_type(platform: Platform) -> type[EnvConfig]:
     return EnvConfig.register_subclass(f"{ENV_PREFIX}{platform.name}")(made)
 
 
-def _register_all() -> tuple[dict[str, type[EnvConfig]], dict[str, str]]:
+def _register_all() -> tuple[dict[str, type[RecoveryEnvConfig]], dict[str, str]]:
     found, unusable = {}, {}
     for platform in all_platforms():
         try:
@@ -100,7 +110,7 @@ ENV_TYPES, _UNUSABLE = _register_all()
 """By platform's name: the env type `roborecover_<name>`."""
 
 
-def env_type(platform: str) -> type[EnvConfig]:
+def env_type(platform: str) -> type[RecoveryEnvConfig]:
     """The env type of a platform.
 
     Raises:

@@ -14,8 +14,12 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 from lerobot_roborecover.env.options import OptionError
+
+if TYPE_CHECKING:
+    from _ctypes import _CData
 
 _EGL_EXTENSIONS = 0x3055
 _EGL_CUDA_DEVICE_NV = 0x323A
@@ -44,7 +48,7 @@ def query_devices() -> list[EglDevice]:
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
 
-    def function(name: str, result: type, *arguments: type):
+    def function(name: str, result: type[_CData], *arguments: type[_CData]):
         address = egl.eglGetProcAddress(name.encode())
         if not address:
             raise OSError(f"this EGL library has no {name}")

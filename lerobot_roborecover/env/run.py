@@ -18,7 +18,7 @@ from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.trial import Trial
-from lerobot_roborecover.env.trial_log import Protocol, TrialLog, TrialRow
+from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.robot_fingerprint import (
     NAME,
@@ -28,7 +28,7 @@ from lerobot_roborecover.platforms.robot_fingerprint import (
     is_robot_entry,
 )
 from lerobot_roborecover.platforms.versions import installed, required, version_problems
-from lerobot_roborecover.scenario import Scenario, Start
+from lerobot_roborecover.scenario import Scenario, Start, TrialStart
 from lerobot_roborecover.workers.messages import SlotConfig
 from lerobot_roborecover.workers.slots import SlotPool
 
@@ -55,7 +55,8 @@ class Run:
 
     pool: SlotPool
     protocol: Protocol
-    log: TrialLog | None
+    log: RowLog | None
+    """None where nobody keeps the rows."""
     dataset: str
     dataset_revision: str | None
     handoff_check: bool = True
@@ -67,21 +68,31 @@ class Run:
     intervention: InterventionFacts | None = None
     """Of a composite policy."""
 
-    def action_width(self, scenario: Scenario) -> int:
+    def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
         options = self.pool.config.options if self.pool is not None else {}
         return platform_named(scenario.platform).policy_action_width(options, scenario.prefix.shape[1])
 
-    def rollback_steps(self, scenario: Scenario) -> int:
+    def rollback_steps(self, scenario: TrialStart) -> int:
         """How far back the policy may ask to go."""
         return self.intervention.rollback_steps(scenario) if self.intervention else 0
+
+    def kept_log(self) -> RowLog:
+        """The log of a run that has one, as every run of `open_run` does.
+
+        Raises:
+            RuntimeError: it has none.
+        """
+        if self.log is None:
+            raise RuntimeError("this run keeps no trial log")
+        return self.log
 
     def rows(self) -> list[TrialRow]:
         """The log's rows of this run's protocol."""
         config_hash = self.protocol.config_hash()
         return [] if self.log is None else [r for r in self.log.rows if r.config_hash == config_hash]
 
-    def trial(self, scenario: Scenario, index: int, protocol: Protocol | None = None) -> Trial:
+    def trial(self, scenario: TrialStart, index: int, protocol: Protocol | None = None) -> Trial:
         """A trial of the run, not begun.
 
         Args:

@@ -29,7 +29,7 @@ from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.intervention_record import InterventionRecord
 from lerobot_roborecover.env.trial_log import Protocol, TrialRow, make_row, trial_key, trial_seed
 from lerobot_roborecover.replay import Handoff
-from lerobot_roborecover.scenario import Outcome, Scenario
+from lerobot_roborecover.scenario import Outcome, TrialStart
 from lerobot_roborecover.workers.messages import (
     ActResult,
     EpisodeSpec,
@@ -98,7 +98,7 @@ class Trial:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: TrialStart,
         index: int,
         protocol: Protocol,
         *,
@@ -330,7 +330,7 @@ class Trial:
         self.state = to
 
 
-def action_problem(scenario: Scenario, action: np.ndarray, width: int) -> str:
+def action_problem(scenario: TrialStart, action: np.ndarray, width: int) -> str:
     """Why an action cannot be sent to the scenario's simulator, in words; empty if it can."""
     if action.shape != (width,):
         return (

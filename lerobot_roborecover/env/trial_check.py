@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 
 from lerobot_roborecover.scenario import DeviationType, Outcome, Source, Stage, Start
@@ -75,7 +76,7 @@ def _text(field: str, value: Any) -> None:
         ) from None
 
 
-def _member(enum: type) -> Callable[[str, Any], None]:
+def _member(enum: type[StrEnum]) -> Callable[[str, Any], None]:
     known = [str(member) for member in enum]
 
     def check(field: str, value: Any) -> None:

@@ -12,7 +12,8 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+import typing
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -322,7 +323,7 @@ def read_log(path: Path, policy: str | None = None) -> ReadLog:
 
 
 @contextmanager
-def _collector_paused() -> Iterator[None]:
+def _collector_paused() -> Generator[None]:
     """Rows hold no cycles; to look for some again and again takes a third of a long log's time."""
     enabled = gc.isenabled()
     gc.disable()
@@ -347,6 +348,22 @@ class Finished(NamedTuple):
 
     success: bool
     steps: int
+
+
+class RowLog(typing.Protocol):
+    """Where a run's rows go."""
+
+    path: Path
+
+    @property
+    def rows(self) -> list[TrialRow]:
+        """All rows, in the order they were written."""
+
+    def find(self, key: tuple) -> Finished | None:
+        """How a trial ended that is already done, else None."""
+
+    def append(self, row: TrialRow) -> None:
+        """Writes a row and waits until it is on disk."""
 
 
 class TrialLog:

@@ -18,7 +18,8 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import replace
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -45,7 +46,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         run: slots, trial log and protocol, shared with the other scenarios.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata = {  # noqa: RUF012 - Gymnasium's, and no ClassVar
         "render_modes": ["rgb_array"],
         "autoreset_mode": gym.vector.AutoresetMode.DISABLED,
     }
@@ -66,22 +67,22 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         self._frame_shape = _FALLBACK_FRAME
         run.pool.acquire()
 
-    @property
-    def single_observation_space(self) -> gym.spaces.Dict:
+    @cached_property
+    def single_observation_space(self) -> gym.Space:
         """One trial's observation; asks a simulator for it on first use."""
         return self.run.pool.spaces()["observation_space"]
 
-    @property
+    @cached_property
     def observation_space(self) -> gym.Space:
         """The batch's observation."""
         return batch_space(self.single_observation_space, self.num_envs)
 
-    @property
-    def single_action_space(self) -> gym.spaces.Box:
+    @cached_property
+    def single_action_space(self) -> gym.Space:
         """One trial's action."""
         return platform_named(self.scenario.platform).action_space(self.run.action_width(self.scenario))
 
-    @property
+    @cached_property
     def action_space(self) -> gym.Space:
         """The batch's actions."""
         return batch_space(self.single_action_space, self.num_envs)

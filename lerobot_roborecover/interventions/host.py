@@ -86,8 +86,7 @@ class InterventionHost:
         return prepared
 
     def _prepare(self, observation: Mapping[str, Any], instruction: str) -> dict[str, torch.Tensor]:
-        batch = preprocess_observation(_with_batch_axis(observation))
-        batch["task"] = [instruction]
+        batch = {**preprocess_observation(_with_batch_axis(observation)), "task": [instruction]}
         return tensors(self._pre(self._env_pre(batch)))
 
     def _after(self, rows: np.ndarray) -> np.ndarray:

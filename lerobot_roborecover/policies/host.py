@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -44,6 +44,23 @@ class Host(Protocol):
         histories: Sequence[Any],
     ) -> list[Chunk | PolicyError]:
         """One chunk of actions per waiting slot; an error in its place where the policy raised for it."""
+
+
+@runtime_checkable
+class MakesHost(Protocol):
+    """A policy that is asked through a host of its own: it keeps histories itself."""
+
+    def make_host(
+        self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int
+    ) -> Host:
+        """Its host.
+
+        Args:
+            env_preprocessor: the env type's observation processor.
+            env_postprocessor: the env type's action processor.
+            preprocessor: the policy type's.
+            max_batch: slots asked for at once, at most.
+        """
 
 
 class Replica(Protocol):

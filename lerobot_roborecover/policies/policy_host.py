@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -189,7 +189,9 @@ class PolicyHost:
             )
         ]
 
-    def _predict(self, observations: Sequence, instructions: Sequence[str], noise: Any) -> list[Chunk]:
+    def _predict(
+        self, observations: Sequence, instructions: Sequence[str], noise: Any
+    ) -> list[Chunk | PolicyError]:
         batch = self._prepare(observations, instructions)
         with self._no_grad(), torch.autocast(self._device.type, enabled=self._amp):
             self._policy.reset()
@@ -218,8 +220,7 @@ class PolicyHost:
     def env_batch(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
         """Observations as the policy's own preprocessor gets them: LeRobot's keys, env processor applied."""
         batch = preprocess_observation(_stack(list(observations)))
-        batch["task"] = list(instructions)
-        return self._env_pre(batch)
+        return self._env_pre({**batch, "task": list(instructions)})
 
     def _prepare(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
         return self._pre(self.env_batch(observations, instructions))
@@ -236,7 +237,7 @@ class PolicyHost:
         return [torch.get_rng_state(), *(torch.cuda.get_rng_state(g) for g in self._gpus())]
 
     @contextmanager
-    def _stream(self, history: History) -> Iterator[None]:
+    def _stream(self, history: History) -> Generator[None]:
         """torch's global generators stand where the trial left them, and are put back afterwards."""
         if history.stream is None:
             yield

@@ -66,8 +66,7 @@ class RemoteHost:
             MappingError: the observations do not fit.
             ServerAwayError: the server stays away, and the run is to stop.
         """
-        batch = preprocess_observation(_stack(list(observations)))
-        batch["task"] = list(instructions)
+        batch = {**preprocess_observation(_stack(list(observations))), "task": list(instructions)}
         frames, tasks = split(self._pre(self._env_pre(batch)))
         if self._policy.translator.frames > 1:
             chunks = self._policy.advance(frames, tasks, histories)

@@ -149,7 +149,7 @@ def statistics_of(pipeline: Any) -> tuple[dict[str, Stats], dict[FeatureType, No
             for name, tensor in stats.items():
                 key, statistic = name.rsplit(".", 1)
                 found.setdefault(key, {})[statistic] = tensor.float().cpu().numpy()
-            return found, dict(step.norm_map)
+            return {**found}, dict(step.norm_map)
     return {}, {}
 
 

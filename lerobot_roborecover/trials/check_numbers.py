@@ -131,8 +131,7 @@ def check_recorded_actions(recorded: np.ndarray, stats: Stats | None) -> Finding
         stats: the checkpoint's.
     """
     name = "recorded actions fit the training data"
-    limits = bounds(stats) if stats else None
-    if limits is None or len(limits[0]) != recorded.shape[1]:
+    if not stats or (limits := bounds(stats)) is None or len(limits[0]) != recorded.shape[1]:
         return ok(name, "not checked: the checkpoint has no statistics of actions of this width")
     low, high = limits
     spread = np.maximum(recorded.std(0), 1e-6)
@@ -168,7 +167,7 @@ def check_gripper(recorded: np.ndarray, stats: Stats | None, columns: Sequence[i
     """
     name = "gripper"
     limits = bounds(stats) if stats else None
-    if limits is None or len(limits[0]) != recorded.shape[1] or "mean" not in stats:
+    if not stats or limits is None or len(limits[0]) != recorded.shape[1] or "mean" not in stats:
         return ok(name, "not checked: the checkpoint has no statistics of actions of this width")
     low, high = limits
     mean = np.ravel(stats["mean"])

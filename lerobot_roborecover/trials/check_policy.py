@@ -18,11 +18,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from lerobot.configs import FeatureType, PreTrainedConfig, parser
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
@@ -81,14 +82,10 @@ class Steps:
     """Of the simulator, observation included."""
 
 
-@parser.wrap()
 def check(cfg: CheckPolicyConfig) -> int:
     """Runs the checks that a command line asks for; see `main`."""
     cfg.runner.check()
-    if not hasattr(cfg.env, "run_spec"):
-        raise OptionError(f"--env.type={cfg.env.type}: not a recovery env type; use roborecover_libero, say")
-    if cfg.policy is None:
-        raise OptionError("no policy: give a checkpoint with --policy.path=FOLDER_OR_HUB_ID")
+    _ = cfg.recovery_env, cfg.given_policy  # refused before anything is loaded
     if not 1 <= cfg.check.steps <= 1000:
         raise OptionError(f"--check.steps={cfg.check.steps}: must be from 1 to 1000")
     with redirect_stdout(sys.stderr):  # LeRobot's loaders print
@@ -106,7 +103,9 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
     Raises:
         OptionError, ScenarioError, TrialLogError: see `env.run.open_run`.
     """
-    path = cfg.policy.pretrained_path
+    config = cfg.given_policy
+    wanted = config.input_features or {}
+    path = config.pretrained_path
     saved = PreTrainedConfig.from_pretrained(path) if path else None
     scenarios, run = _open(cfg)
     width = cfg.env.features["action"].shape[0]
@@ -119,15 +118,15 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
             host = load_host(host_spec(cfg))
         except Exception as err:  # a checkpoint may fail to load in any way
             return [_not_loaded(err), *findings]
-        findings.insert(0, ok("loads", f"{cfg.policy.type} on {cfg.policy.device}"))
+        findings.insert(0, ok("loads", f"{config.type} on {config.device}"))
         parts = getattr(host, "parts", None)
         policy = parts[0] if parts else None
-        if policy is not None and path and not getattr(cfg.policy, "use_peft", False):
+        if policy is not None and path and not config.use_peft:
             findings.append(names.check_weights(policy, str(path)))
         if parts:
-            findings.append(names.check_statistics(parts[1], parts[2], cfg.policy.input_features, width))
+            findings.append(names.check_statistics(parts[1], parts[2], wanted, width))
         horizons = [s.task.horizon for s in scenarios]
-        findings.append(names.check_horizon(cfg.policy, run.pool.config.platform, min(horizons)))
+        findings.append(names.check_horizon(config, run.pool.config.platform, min(horizons)))
         scenario = min(scenarios, key=lambda s: len(s.prefix))
         start = _hand_off(run, scenario)
         if isinstance(start, Finding):
@@ -152,7 +151,7 @@ def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, Run]:
     folder = tempfile.TemporaryDirectory(prefix="roborecover-check-")
     log = f"{folder.name}/trials.jsonl"
     facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes)
-    options = copy(cfg.env)
+    options = copy(cfg.recovery_env)
     options.trial_log = log
     scenarios, run = open_run(options, options.run_spec(), workers=True, facts=facts)
     run.pool.on_close(folder.cleanup)
@@ -186,6 +185,7 @@ def _hand_off(run: Run, scenario: Scenario) -> EpisodeStart | Finding:
             "simulator", reply.message, f"scenario {scenario.id} handed off",
             "'roborecover doctor' checks simulators and OpenGL",
         )  # fmt: skip
+    assert isinstance(reply, EpisodeStart)
     if reply.handoff.problem is not None:
         return failure(
             "simulator", f"{reply.handoff.problem.value}: {reply.handoff.reason}",
@@ -230,7 +230,7 @@ def _take_steps(
                 assert isinstance(reply, ActResult)
                 actions.append(np.asarray(action, dtype=np.float64))
                 step_s.append(reply.seconds)
-                if reply.over:
+                if reply.observation is None:  # the trial is over
                     break
                 observations.append(reply.observation)
             else:
@@ -256,6 +256,8 @@ def _look(
 ) -> list[Finding]:
     """Inputs, pictures and recorded actions, before the policy is asked for anything."""
     _, pre, post = host.parts
+    config = cfg.given_policy
+    wanted = config.input_features or {}
     platform = platform_named(run.pool.config.platform)
     try:
         batch = host.env_batch([start.observation], [scenario.task.instruction])
@@ -270,18 +272,14 @@ def _look(
     tensors = {cfg.rename_map.get(k, k): v for k, v in batch.items() if hasattr(v, "shape")}
     shapes = {k: tuple(v.shape[1:]) for k, v in tensors.items()}
     found = [
-        names.check_features(cfg.policy.input_features, shapes, cfg.policy.type, bool(cfg.rename_map)),
+        names.check_features(wanted, shapes, config.type, bool(cfg.rename_map)),
     ]
     in_stats, _ = names.statistics_of(pre)
     out_stats, _ = names.statistics_of(post)
-    pictures = {
-        k: v[0].float().cpu().numpy()
-        for k, v in tensors.items()
-        if v.ndim == 4 and k in cfg.policy.input_features
-    }
+    pictures = {k: v[0].float().cpu().numpy() for k, v in tensors.items() if v.ndim == 4 and k in wanted}
     by_colour = numbers.check_cameras_by_colour({k: p.mean((1, 2)) for k, p in pictures.items()}, in_stats)
     found += [by_colour] if by_colour else []
-    if platform.turned_pictures and pictures and cfg.policy.type != "xvla":  # it turns the scene camera alone
+    if platform.turned_pictures and pictures and config.type != "xvla":  # it turns the scene camera alone
         raw = next(iter(start.observation["pixels"].values()))
         key = next(iter(_cameras(cfg).values()))
         if key in pictures:
@@ -393,4 +391,4 @@ def main(argv: Sequence[str]) -> int:
     words = ["--check.json=true" if a == "--json" else a for a in argv]
     # LeRobot's parser reads the process's own argument list, in several places.
     sys.argv[:] = rewrite_env_argument(["roborecover-eval", *words])
-    return check()
+    return run_with_arguments(check)

@@ -21,7 +21,7 @@ from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.env.trial_log import TrialRow, trial_key
 from lerobot_roborecover.policies.host import PolicyError, Replica, ReplicaLostError
-from lerobot_roborecover.scenario import Outcome, Scenario
+from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
@@ -85,7 +85,7 @@ class Engine:
         self.reruns = 0
         """Trials that were begun again because a machine was lost."""
 
-    def run(self, units: Sequence[Unit[Scenario]], stop: Callable[[], bool] = lambda: False) -> int:
+    def run(self, units: Sequence[Unit[TrialStart]], stop: Callable[[], bool] = lambda: False) -> int:
         """Runs all units that the log does not hold yet.
 
         Args:
@@ -134,7 +134,7 @@ class Engine:
         users = [s.replica for s in self._sittings()]
         return min((r for r in self._replicas if not r.opening), key=users.count, default=None)
 
-    def _start(self, seat: Seat, unit: Unit[Scenario], replica: Replica) -> None:
+    def _start(self, seat: Seat, unit: Unit[TrialStart], replica: Replica) -> None:
         trial = self._run.trial(unit.scenario, unit.trial)
         seat.last = unit
         seat.sitting = Sitting(seat, unit, trial, replica, replica.host.start(trial.seed))
@@ -308,7 +308,7 @@ class Engine:
         self._on_row(row)
 
 
-def unfinished(run: Run, units: Sequence[Unit[Scenario]]) -> list[Unit[Scenario]]:
+def unfinished[S: TrialStart](run: Run, units: Sequence[Unit[S]]) -> list[Unit[S]]:
     """Units that the run's trial log does not hold yet."""
     if run.log is None:
         return list(units)

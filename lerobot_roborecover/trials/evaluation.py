@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import random
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import asdict, replace
@@ -22,7 +22,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
-from lerobot_roborecover.env.configs import env_type
+from lerobot_roborecover.env.configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.identity import weights_identity
 from lerobot_roborecover.env.options import OptionError
@@ -30,7 +30,7 @@ from lerobot_roborecover.env.processors import env_processors
 from lerobot_roborecover.env.render_device import egl_devices, render_environment
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial_log import TrialRow
-from lerobot_roborecover.policies.host import Host
+from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials.engine import units_of
@@ -128,7 +128,7 @@ def evaluate(
 
 
 @contextmanager
-def untouched(policy: torch.nn.Module | None = None) -> Iterator[None]:
+def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
     """Puts back what an evaluation changes in a process.
 
     Args:
@@ -168,7 +168,7 @@ def _scenario_set(scenarios: Any, env: Any) -> ScenarioSet:
     return ScenarioSet(given, "memory", None, {"platform": given[0].platform})
 
 
-def _env_config(env: Any, platform: str) -> Any:
+def _env_config(env: Mapping[str, Any] | RecoveryEnvConfig | None, platform: str) -> RecoveryEnvConfig:
     if env is not None and not isinstance(env, Mapping):
         return copy(env)
     try:
@@ -177,7 +177,7 @@ def _env_config(env: Any, platform: str) -> Any:
         raise OptionError(f"env={dict(env or {})}: {' '.join(str(err).split())}") from None
 
 
-def _policy_config(policy: Any, device: str | None) -> Any:
+def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
     if isinstance(policy, str | Path):
         return policy_config(str(policy), (), device)
     config = policy if isinstance(policy, PreTrainedConfig) else getattr(policy, "config", None)
@@ -203,6 +203,6 @@ def _host(spec: HostSpec, module: torch.nn.Module | None, processors: tuple[Any,
     before, after = processors or load_processors(module.config, spec)
     module.eval()
     env_pre, env_post = env_processors(spec.env, spec.policy)
-    if hasattr(module, "make_host"):
+    if isinstance(module, MakesHost):
         return module.make_host(env_pre, env_post, before, spec.max_batch)
     return PolicyHost(module, env_pre, env_post, before, after, spec.max_batch, in_training=True)

@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.processors import env_processors
-from lerobot_roborecover.policies.host import Host
+from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.trials.load_problems import load_remedy, other_action_width
 from lerobot_roborecover.trials.portable import make_portable
@@ -24,10 +26,10 @@ from lerobot_roborecover.trials.portable import make_portable
 class HostSpec:
     """What a policy host is made from."""
 
-    policy: Any
-    """The policy's configuration (`PreTrainedConfig`), options applied."""
-    env: Any
-    """A recovery env config, which says what is observed."""
+    policy: PreTrainedConfig
+    """The policy's configuration, options applied."""
+    env: RecoveryEnvConfig
+    """What is observed."""
     rename_map: Mapping[str, str] = field(default_factory=dict)
     """The env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`."""
     seed: int | None = 1000
@@ -38,7 +40,7 @@ class HostSpec:
     """See `runner.RunnerOptions.portable`."""
 
 
-def policy_config(policy: str, options: Sequence[str] = (), device: str | None = None) -> Any:
+def policy_config(policy: str, options: Sequence[str] = (), device: str | None = None) -> PreTrainedConfig:
     """A checkpoint's own config.
 
     Args:
@@ -50,7 +52,6 @@ def policy_config(policy: str, options: Sequence[str] = (), device: str | None =
         OptionError: there is no such checkpoint.
     """
     import lerobot.policies  # noqa: F401 - registers LeRobot's policy types
-    from lerobot.configs.policies import PreTrainedConfig
 
     from lerobot_roborecover.interventions import configuration_intervention  # noqa: F401 - and ours
     from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
@@ -100,7 +101,7 @@ def _load_host(spec: HostSpec) -> Host:
         make_portable(policy)
     preprocessor, postprocessor = load_processors(policy.config, spec)
     env_pre, env_post = env_processors(spec.env, spec.policy)
-    if hasattr(policy, "make_host"):  # a composite policy keeps histories of its own
+    if isinstance(policy, MakesHost):
         return policy.make_host(env_pre, env_post, preprocessor, spec.max_batch)
     return PolicyHost(policy, env_pre, env_post, preprocessor, postprocessor, spec.max_batch)
 
@@ -112,12 +113,13 @@ def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
         config: of the loaded policy, which knows its device.
         spec: of the host.
     """
+    path = spec.policy.pretrained_path
     overrides = {
         "device_processor": {"device": str(config.device)},
         "rename_observations_processor": {"rename_map": dict(spec.rename_map)},
     }
     return make_pre_post_processors(
         policy_cfg=spec.policy,
-        pretrained_path=spec.policy.pretrained_path,
+        pretrained_path=None if path is None else str(path),
         preprocessor_overrides=overrides,
     )

@@ -24,7 +24,7 @@ class LocalEngine(Engine):
     """
 
     def __init__(self, run: Run, host: Host, *, slots: int, **options: Any):
-        super().__init__(run, run.pool.slots(slots), [InlineReplica(host)], wait, **options)
+        super().__init__(run, run.pool.worker_slots(slots), [InlineReplica(host)], wait, **options)
 
 
 def open_local_engine(

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 
@@ -106,6 +106,30 @@ class Tally:
         return rate_estimate(rates, [self._units[scenario] for scenario in self._counts])
 
 
+class Shown(Protocol):
+    """How far something is, as `ProgressLine` asks."""
+
+    @property
+    def total(self) -> int:
+        """Of all."""
+
+    @property
+    def done(self) -> int:
+        """Finished."""
+
+    @property
+    def rate(self) -> float | None:
+        """Share of successes; None before there is one."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The rate's; None where there is none."""
+
+    @property
+    def note(self) -> str:
+        """What the line says beside the rate."""
+
+
 class ProgressLine:
     """One line that is kept up to date on a terminal, or repeated now and then in a file.
 
@@ -134,7 +158,7 @@ class ProgressLine:
         self._shown_at = float("-inf")
         self._last = ""
 
-    def show(self, tally: Tally, *, final: bool = False) -> None:
+    def show(self, tally: Shown, *, final: bool = False) -> None:
         """Writes the line if it says something new."""
         now = self._clock()
         if self._done_before is None:
@@ -152,7 +176,7 @@ class ProgressLine:
         self._stream.flush()
         self._last, self._shown_at = text, now
 
-    def _text(self, tally: Tally, now: float) -> str:
+    def _text(self, tally: Shown, now: float) -> str:
         """The line: trials, running rate, time left."""
         parts = [f"{self._label:<9} {tally.done:>3}/{tally.total} {self._unit}"]
         if tally.rate is not None:

@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.env.command_line import run_with_arguments
+from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.render_device import egl_devices, render_environment
@@ -107,6 +109,36 @@ class RecoveryEvalConfig(EvalPipelineConfig):
 
     runner: RunnerOptions = field(default_factory=RunnerOptions)
 
+    @property
+    def recovery_env(self) -> RecoveryEnvConfig:
+        """`env`.
+
+        Raises:
+            OptionError: it is another kind of environment.
+        """
+        if not isinstance(self.env, RecoveryEnvConfig):
+            raise OptionError(
+                f"--env.type={self.env.type}: not a recovery env type; use roborecover_libero, say"
+            )
+        return self.env
+
+    @property
+    def given_policy(self) -> PreTrainedConfig:
+        """`policy`.
+
+        Raises:
+            OptionError: there is none.
+        """
+        if self.policy is None:
+            raise OptionError("no policy: give a checkpoint with --policy.path=FOLDER_OR_HUB_ID")
+        return self.policy
+
+    @property
+    def folder(self) -> Path:
+        """`output_dir`."""
+        assert self.output_dir is not None, "LeRobot sets it where nobody did"
+        return Path(self.output_dir)
+
 
 class Stopper:
     """Says when to stop: after a time limit, or at the first Ctrl-C (the second one kills).
@@ -135,29 +167,26 @@ class Stopper:
         signal.signal(signal.SIGINT, self._before)
 
 
-@parser.wrap()
 def evaluate(cfg: RecoveryEvalConfig) -> int:
     """Runs the evaluation that a command line asks for; see `main`."""
     cfg.runner.check()
-    if not hasattr(cfg.env, "run_spec"):
-        raise OptionError(f"--env.type={cfg.env.type}: not a recovery env type; use roborecover_libero, say")
-    if cfg.policy is None:
-        raise OptionError("no policy: give a checkpoint with --policy.path=FOLDER_OR_HUB_ID")
+    env, policy = cfg.recovery_env, cfg.given_policy
     if cfg.eval.recording:
         raise OptionError(
             "--eval.recording=true: roborecover eval records no dataset. Use lerobot-eval for that, or "
             "--videos=N for films"
         )
-    out = Path(cfg.output_dir)
-    facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes, output_dir=out)
-    scenarios, run = open_run(cfg.env, cfg.env.run_spec(), workers=True, facts=facts)
+    out = cfg.folder
+    facts = facts_of(policy, n_episodes=cfg.eval.n_episodes, output_dir=out)
+    scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
+    log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
     run.pool.acquire()
     stopper = Stopper(cfg.runner.limit_seconds)
     try:
         watch = open_watch(
             cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
-            log=run.log.path, shard=cfg.env.shard,
+            log=log.path, shard=env.shard,
         )  # fmt: skip
         order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
         units = units_of(order, cfg.eval.n_episodes)
@@ -181,7 +210,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             ids = [s.id for s in scenarios]
             videos = VideoKeeper(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
         if watch is not None:
-            watch.record(run.log.path)
+            watch.record(log.path)
         if tally.done < tally.total and not settled():
             options = {
                 "batch_delay_s": cfg.runner.batch_delay_ms / 1e3, "on_row": show, "videos": videos,
@@ -191,7 +220,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             make(cfg, run, units, options).run(units, stopper)
         line.show(tally, final=True)
         if watch is not None:
-            record = watch.record(run.log.path)
+            record = watch.record(log.path)
         report(cfg, run, scenarios, [] if videos is None else videos.kept)
         if watch is not None and record is not None:
             print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
@@ -200,7 +229,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
         if stopper.reason:
             print(
                 f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, run the same "
-                f"command with --env.trial_log={run.log.path} --output_dir={out}",
+                f"command with --env.trial_log={log.path} --output_dir={out}",
                 file=sys.stderr,
             )
             return 130 if stopper.reason == "interrupted" else 0
@@ -213,28 +242,31 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
 def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
     """The run's policy."""
     runner = cfg.runner
-    return HostSpec(cfg.policy, cfg.env, cfg.rename_map, cfg.seed, runner.max_batch, runner.portable)
+    return HostSpec(
+        cfg.given_policy, cfg.recovery_env, cfg.rename_map, cfg.seed, runner.max_batch, runner.portable
+    )
 
 
 def _local_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
-    drawing = None
-    if cfg.env.obs_type != "state" or cfg.runner.videos:
-        drawing = render_environment(cfg.runner.render_device, str(cfg.policy.device), egl_devices())
-    slots = cfg.runner.slots or default_slots(str(cfg.policy.device), usable_cores(), available_gb())
+    drawing, device = None, str(cfg.given_policy.device)
+    if cfg.recovery_env.obs_type != "state" or cfg.runner.videos:
+        drawing = render_environment(cfg.runner.render_device, device, egl_devices())
+    slots = cfg.runner.slots or default_slots(device, usable_cores(), available_gb())
     return open_local_engine(run, units, lambda: load_host(host_spec(cfg)), slots, drawing, **options)
 
 
 def _ray_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
     from lerobot_roborecover.trials.ray_engine import open_ray_engine
 
-    renders = cfg.env.obs_type != "state" or cfg.runner.videos
+    env = cfg.recovery_env
+    first = UnitQueue(units).take(None) if env.obs_type != "state" or cfg.runner.videos else None
     cluster = {
         "address": cfg.runner.ray_address,
         "slots": cfg.runner.slots,
         "replicas": cfg.runner.replicas,
-        "gpus": 1.0 if str(cfg.policy.device).startswith("cuda") else 0.0,
-        "snapshot_dir": cfg.env.snapshot_dir or None,
-        "smoke": UnitQueue(units).take(None).scenario if renders else None,
+        "gpus": 1.0 if str(cfg.given_policy.device).startswith("cuda") else 0.0,
+        "snapshot_dir": env.snapshot_dir or None,
+        "smoke": None if first is None else first.scenario,
         "render_device": cfg.runner.render_device,
     }
     return open_ray_engine(run, partial(load_host, host_spec(cfg)), **cluster, **options)
@@ -253,12 +285,12 @@ def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Seq
     rows = [r for r in run.rows() if r.scenario_id in wanted and r.trial < cfg.eval.n_episodes]
     names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in films]
     videos = {(m[1], int(m[2])): str(p) for m, p in names if m}
-    out = Path(cfg.output_dir)
+    out = cfg.folder
     out.mkdir(parents=True, exist_ok=True)
-    info = eval_info(rows, cfg.env.group_by, videos)
+    info = eval_info(rows, cfg.recovery_env.group_by, videos)
     (out / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
     print(format_table(summarise([asdict(r) for r in rows])))
-    print(f"\ntrial log {run.log.path}\neval info {out / 'eval_info.json'}")
+    print(f"\ntrial log {run.kept_log().path}\neval info {out / 'eval_info.json'}")
     if films:
         print(f"videos {films[0].parent} ({len(films)})")
 
@@ -318,7 +350,7 @@ def main(argv: Sequence[str]) -> int:
     register_third_party_plugins()
     # LeRobot's parser reads the process's own argument list, in several places.
     sys.argv[:] = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
-    return evaluate()
+    return run_with_arguments(evaluate)
 
 
 def _long_names(argv: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from lerobot_roborecover.env.trial import Trial, TrialState
 from lerobot_roborecover.policies.host import Replica
-from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.scenario import TrialStart
 from lerobot_roborecover.trials.units import Unit
 from lerobot_roborecover.trials.videos import Recording
 from lerobot_roborecover.workers.messages import Reply
@@ -43,7 +43,7 @@ class Seat:
     """A slot and who sits there."""
 
     slot: EngineSlot
-    last: Unit[Scenario] | None = None
+    last: Unit[TrialStart] | None = None
     """Who sat there last, or sits there."""
     sitting: Sitting | None = None
     """None where it is idle."""
@@ -54,7 +54,7 @@ class Sitting:
     """A trial in its seat."""
 
     seat: Seat
-    unit: Unit[Scenario]
+    unit: Unit[TrialStart]
     trial: Trial
     """Of `unit`."""
     replica: Replica | None

@@ -78,11 +78,11 @@ class EvaluationCallback:
             return {}
         from lerobot_roborecover.trials.evaluation import evaluate
 
-        options = {"name": f"step {step}", **self.options}
+        options: dict[str, Any] = {"name": f"step {step}", **self.options, "processors": processors}
         rows: list[TrialRow] = []
         for start in self.starts:
-            env = {**options.get("env", {}), "start": start}
-            rows += evaluate(policy, self.scenarios, **{**options, "env": env, "processors": processors})
+            options["env"] = {**self.options.get("env", {}), "start": start}
+            rows += evaluate(policy, self.scenarios, **options)
         metrics = metrics_of(rows)
         self.log(metrics, step=step)
         return metrics

@@ -106,6 +106,8 @@ class Videos:
         try:
             with av.open(str(clip.path)) as container:
                 stream = container.streams.video[0]
+                if stream.time_base is None:
+                    raise ValueError("the stream has no time base")
                 # To the keyframe at or before the frame; half a frame of slack for rounded times.
                 seek_s = max(start - _HALF / self.fps, 0.0)
                 container.seek(int(seek_s / stream.time_base), stream=stream)

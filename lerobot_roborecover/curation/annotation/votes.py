@@ -104,7 +104,8 @@ def parse_vote(sent: object, *, first_step: int, steps: int, human: bool) -> Vot
     known = {"uid", "candidate", "verdict", "step", "stage", "deviation", "reason", "comment", "seconds"}
     if not isinstance(sent, dict) or not set(sent) <= known:
         raise VoteError(f"a vote is an object with the fields {', '.join(sorted(known))}")
-    vote = Vote(**{"uid": "", "candidate": "", "verdict": "", **sent})
+    fields: dict[str, Any] = {"uid": "", "candidate": "", "verdict": "", **sent}
+    vote = Vote(**fields)
     _need(
         isinstance(vote.uid, str) and _UID.fullmatch(vote.uid), "uid", vote.uid, "8 to 64 letters and digits"
     )
@@ -169,8 +170,8 @@ class Ballot:
     """uids of the votes that stand, in the order in which they were made."""
 
 
-def ballot(records: Iterable[Mapping[str, Any]], round_number: int) -> Ballot:
-    """Folds a journal.
+def ballot(records: Iterable[Mapping[str, Any]], round_number: int | None) -> Ballot:
+    """Folds a journal; of no round where there is no number.
 
     Raises:
         ScenarioError: a record is none of an annotator's.
@@ -284,7 +285,7 @@ class VoteBook:
         self._ballot = ballot(self._journal.records, self.round)
 
 
-def read_votes(folder: Path) -> dict[str, Sequence[Mapping[str, Any]]]:
+def read_votes(folder: Path) -> dict[str, list[dict[str, Any]]]:
     """Every annotator's records, by name.
 
     Raises:

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_roborecover.curation.attrition import StageCounts, attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
@@ -32,6 +32,9 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.scenario import ScenarioError, Task
 from lerobot_roborecover.words import counted
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.env.configs import RecoveryEnvConfig
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def plan(options: CollectOptions, say: Callable[[str], None] = print) -> list[Pl
     return _units(options, env, say)
 
 
-def _env(options: CollectOptions) -> tuple[Any, PlatformPart]:
+def _env(options: CollectOptions) -> tuple[RecoveryEnvConfig, PlatformPart]:
     """The recovery env config and its part of a run, checked."""
     from lerobot_roborecover.curation.policy_trials import env_config
 
@@ -116,12 +119,13 @@ def _env(options: CollectOptions) -> tuple[Any, PlatformPart]:
         given.append("--obs_type=state")
     env = env_config(options.platform, "none", given)
     recorded = platform_named(options.platform).records_control_mode
-    if recorded is not None and env.control_mode != recorded:
+    mode = getattr(env, "control_mode", None)
+    if recorded is not None and mode != recorded:
         raise OptionError(
-            f"--env.control_mode={env.control_mode}: scenarios hold {recorded} actions; only policies "
+            f"--env.control_mode={mode}: scenarios hold {recorded} actions; only policies "
             f"of {recorded} actions can be collected from"
         )
-    if getattr(env, "action_mode", "joint") == "ee" and env.control_mode != "absolute":
+    if getattr(env, "action_mode", "joint") == "ee" and mode != "absolute":
         raise OptionError(
             "--env.action_mode=ee: recorded poses are absolute; collect with --env.control_mode=absolute"
         )

@@ -74,11 +74,12 @@ class CollectServer(SlotServer):
 
     def answer(self, command: str, argument: object = None) -> object:
         """`drive` and `film` beside the usual commands."""
-        begin = {"drive": self._drive, "film": self._film}.get(command)
-        if begin is None:
+        if command not in ("drive", "film"):
             return super().answer(command, argument)
-        if argument is not None:
-            self._under_way = begin(argument)
+        if isinstance(argument, Planned):
+            self._under_way = self._drive(argument)
+        elif isinstance(argument, FilmJob):
+            self._under_way = self._film(argument)
         # A watchdog that counted a whole rollout would take a slow machine for a hung simulator.
         began = time.monotonic()
         for result in self._under_way:

@@ -119,7 +119,7 @@ def from_rollouts(
     for row, actions in zip(rollouts.rows, rollouts.actions(), strict=True):
         link = rollouts.scenarios[row.scenario_index] if row.scenario_index >= 0 else None
         scenario = scenarios.get(link.id) if link else None
-        if scenario is None:
+        if link is None or scenario is None:
             dropped["belongs to no scenario of the set"] += 1
         elif scenario.sha256() != link.sha256:
             dropped["belongs to another version of its scenario"] += 1

@@ -11,7 +11,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,7 +38,7 @@ class _Problems:
     found: list[str] = field(default_factory=list)
 
     @contextmanager
-    def of(self, where: str) -> Iterator[None]:
+    def of(self, where: str) -> Generator[None]:
         """Notes a refusal of the block under its place in the file."""
         said = io.StringIO()
         try:

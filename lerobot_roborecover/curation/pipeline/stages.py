@@ -255,7 +255,8 @@ class Chain:
 
     def _rule(self) -> ResolutionConfig:
         part = self.config.annotate
-        return ResolutionConfig(part.votes_needed, part.tolerance, part.no_consensus)  # type: ignore[arg-type]
+        no_consensus = "discuss" if part.no_consensus == "discuss" else "drop"  # checked when it was read
+        return ResolutionConfig(part.votes_needed, part.tolerance, no_consensus)
 
     def _open(self) -> dict[str, int]:
         """Candidates that are not settled, by why."""

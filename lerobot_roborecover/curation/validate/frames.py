@@ -116,6 +116,8 @@ def encoded(frames: Sequence[np.ndarray], encoder: Encoder) -> list[np.ndarray]:
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream(encoder.codec, encoder.fps, options=dict(encoder.options))
+        if not isinstance(stream, av.VideoStream):
+            raise ScenarioError(f"{encoder.codec} is no codec of videos")
         stream.pix_fmt = encoder.pix_fmt
         stream.height, stream.width = frames[0].shape[:2]
         stream.time_base = Fraction(1, encoder.fps)
@@ -125,8 +127,9 @@ def encoded(frames: Sequence[np.ndarray], encoder: Encoder) -> list[np.ndarray]:
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     buffer.seek(0)
-    with av.open(buffer) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    with av.open(buffer, "r") as container:
+        found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    return found
 
 
 def ssim(original: np.ndarray, replay: np.ndarray) -> tuple[float, ...]:

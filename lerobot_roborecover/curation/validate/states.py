@@ -101,23 +101,23 @@ def _marked(recorded: Fingerprint | None, replayed: Fingerprint) -> Fingerprint:
 
 def _compared(scenario: Scenario, one: Replayed, other: Replayed) -> tuple[str, float]:
     """What speaks against a scenario's replayed state, and how far it is from the recorded one, in mm."""
-    marks = one.scenario.fingerprint, other.scenario.fingerprint
-    if one.error or other.error or marks[0] is None or marks[1] is None:
+    mark, again = one.scenario.fingerprint, other.scenario.fingerprint
+    if one.error or other.error or mark is None or again is None:
         return f"it cannot be replayed ({one.error or other.error})", 0.0
-    if not marks[0].state_sha256:
+    if not mark.state_sha256:
         return "its simulator gives no hash of its state", 0.0
-    if marks[0].state_sha256 != marks[1].state_sha256:
+    if mark.state_sha256 != again.state_sha256:
         return "two replays reach different states", 0.0
     recorded = scenario.fingerprint
     if recorded is None:
         return "", 0.0
-    if recorded.state_sha256 not in ("", marks[0].state_sha256):
+    if recorded.state_sha256 not in ("", mark.state_sha256):
         return "the state is not the recorded one; compare versions (roborecover doctor)", 0.0
-    missing = sorted(set(recorded.bodies) - set(marks[0].bodies))
+    missing = sorted(set(recorded.bodies) - set(mark.bodies))
     if missing:
         return f"the simulator has no body {missing[0]!r}, which was recorded", 0.0
-    far = max(recorded.bodies, key=lambda n: marks[0].bodies[n].distance_m(recorded.bodies[n]))
-    distance_m = marks[0].bodies[far].distance_m(recorded.bodies[far])
+    far = max(recorded.bodies, key=lambda n: mark.bodies[n].distance_m(recorded.bodies[n]))
+    distance_m = mark.bodies[far].distance_m(recorded.bodies[far])
     if not distance_m <= HANDOFF_TOLERANCE_M:
         return (
             f"{far} is {distance_m * 1e3:.2f} mm from where it was recorded; the limit is "

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.curation.attrition import Decision, VerdictName
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Pose, Scenario, ScenarioError
 
 PAPER_PASS_RATE = 0.9732
@@ -151,7 +151,10 @@ class Replays:
             )
         recorded = scenario.fingerprint
         if recorded is None:
-            poses = {name: Pose(tuple(p[:3]), tuple(p[3:])) for name, p in self.bodies.items()}
+            poses = {
+                name: Pose((x, y, z), (qx, qy, qz, qw))
+                for name, (x, y, z, qx, qy, qz, qw) in self.bodies.items()
+            }
             recorded = Fingerprint(len(scenario.prefix), poses, "", {})
         versions = dict(self.versions) or recorded.versions
         return replace(recorded, state_sha256=self.runs[0].state_sha256, versions=versions)
@@ -159,21 +162,25 @@ class Replays:
 
 def replays_from(entry: Mapping[str, Any]) -> Replays:
     """Replays as they were written with `dataclasses.asdict` and JSON."""
-    runs = tuple(
-        RunReplay(**{**r, "recorded": tuple(r["recorded"]), "replayed": tuple(r["replayed"])})
-        for r in entry["runs"]
-    )
-    tuples = {
-        name: {k: tuple(v) for k, v in entry.get(name, {}).items()} for name in ("ssim", "bodies")
-    }  # fmt: skip
-    return Replays(**{**entry, "runs": runs, **tuples})
+    fields = dict[str, Any](entry)
+    fields["runs"] = tuple(_run_from(run) for run in entry["runs"])
+    for name in ("ssim", "bodies"):
+        fields[name] = {k: tuple(v) for k, v in entry.get(name, {}).items()}
+    return Replays(**fields)
+
+
+def _run_from(entry: Mapping[str, Any]) -> RunReplay:
+    fields = dict[str, Any](entry)
+    for name in ("recorded", "replayed"):
+        fields[name] = tuple(entry[name])
+    return RunReplay(**fields)
 
 
 def judge(scenario_id: str, replays: Replays, rule: ValidationRule) -> Decision:
     """The verdict on a scenario; the first of several reasons is named, the detail has all values."""
     by = f"{len(replays.runs)} screening runs, seed {rule.seed}"
 
-    def decided(verdict: str, reason: str, detail: str) -> Decision:
+    def decided(verdict: VerdictName, reason: str, detail: str) -> Decision:
         return Decision(scenario_id, "validate", verdict, reason, detail, by)
 
     if replays.error:

@@ -83,7 +83,7 @@ class Handlers:
         """
         name = request.path_params["annotator"]
         annotator = self.study.annotators.get(name)
-        check_token(request, name, annotator and annotator.token, "roborecover annotate")
+        check_token(request, name, None if annotator is None else annotator.token, "roborecover annotate")
         assert annotator is not None
         return annotator
 
@@ -253,7 +253,9 @@ class Handlers:
 
     def _vote_json(self, vote: Vote | None) -> dict[str, Any] | None:
         # An episode that was voted on and is not in the dataset any more has no name.
-        return vote and vote_json(vote, self.study.names.episodes.get(vote.candidate, ""))
+        if vote is None:
+            return None
+        return vote_json(vote, self.study.names.episodes.get(vote.candidate, ""))
 
 
 def make_app(study: Study) -> Starlette:

@@ -10,7 +10,7 @@ with Client("http://127.0.0.1:8732/drive/?token=...") as client:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -200,7 +200,7 @@ _REMEDY = "What it had called saved is on its disk; start it again"
 
 
 @contextmanager
-def _connection() -> Iterator[None]:
+def _connection() -> Generator[None]:
     """One message for a connection that breaks, whether it is noticed in sending or in receiving."""
     from websockets.exceptions import WebSocketException
 

@@ -96,12 +96,15 @@ class Store:
 
     def paths(self) -> list[Path]:
         """Recordings in the order in which they were saved."""
-        return sorted(p for p in self.folder.iterdir() if _FILE.fullmatch(p.name))
+        return [path for _, path in self._numbered()]
+
+    def _numbered(self) -> list[tuple[int, Path]]:
+        found = [(_FILE.fullmatch(p.name), p) for p in self.folder.iterdir()]
+        return sorted((int(match[1]), path) for match, path in found if match)
 
     def next_number(self) -> int:
         """Of the next recording."""
-        paths = self.paths()
-        return int(_FILE.fullmatch(paths[-1].name).group(1)) + 1 if paths else 1
+        return max((number for number, _ in self._numbered()), default=0) + 1
 
     def add(self, recorded: Recorded, number: int) -> Path:
         """Saves a recording; it is on disk when this returns.
@@ -165,12 +168,13 @@ def read_recording(path: Path) -> Recorded:
             n: Pose(tuple(p["position_m"]), tuple(p["quat_xyzw"]))
             for n, p in document["reset"]["fixtures"].items()
         }
+        reset: dict[str, Any] = {**document["reset"], "fixtures": fixtures}
         mark = document["mark"]
         return Recorded(
             id=document["id"],
             operator=document["operator"],
             task=Task(**document["task"]),
-            reset=Reset(**{**document["reset"], "fixtures": fixtures}),
+            reset=Reset(**reset),
             actions=actions,
             bodies=dict(zip(document["bodies"], poses, strict=True)),
             solved=solved,
