@@ -128,8 +128,7 @@ def encoded(frames: Sequence[np.ndarray], encoder: Encoder) -> list[np.ndarray]:
         container.mux(stream.encode(None))
     buffer.seek(0)
     with av.open(buffer, "r") as container:
-        found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    return found
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def ssim(original: np.ndarray, replay: np.ndarray) -> tuple[float, ...]:

@@ -152,8 +152,7 @@ class Replays:
         recorded = scenario.fingerprint
         if recorded is None:
             poses = {
-                name: Pose((x, y, z), (qx, qy, qz, qw))
-                for name, (x, y, z, qx, qy, qz, qw) in self.bodies.items()
+                name: Pose((p[0], p[1], p[2]), (p[3], p[4], p[5], p[6])) for name, p in self.bodies.items()
             }
             recorded = Fingerprint(len(scenario.prefix), poses, "", {})
         versions = dict(self.versions) or recorded.versions
