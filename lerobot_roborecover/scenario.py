@@ -108,6 +108,11 @@ class Outcome(StrEnum):
         """Whether the policy had its full chance."""
         return self in (Outcome.SUCCESS, Outcome.HORIZON)
 
+    @property
+    def infrastructure(self) -> bool:
+        """Whether a simulator or a machine ended it, and neither the policy nor the scenario."""
+        return self in (Outcome.SIM_ERROR, Outcome.TIMEOUT)
+
 
 _POSE = "pose must be 3 finite metres and 4 finite quaternion terms"
 

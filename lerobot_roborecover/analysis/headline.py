@@ -10,6 +10,7 @@ from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
+from lerobot_roborecover.words import counted
 
 
 def headline(results: Results) -> str:
@@ -21,6 +22,12 @@ def headline(results: Results) -> str:
         + _intervals(results, best, rate)
         + "."
     ]
+    if lost := int(results.ranked.by_infrastructure[best].sum()):
+        reached = float(np.nanmean(results.ranked.reached_rates[best]))
+        sentences.append(
+            f"{counted(lost, 'trial')} of it ended with a simulator or a machine and counts as a failure; "
+            f"without, {100 * reached:.1f} %."
+        )
     if results.several_runs:
         sentences.append(_method(results, name))
     if not results.compared.complete:

@@ -61,6 +61,19 @@ class Panel:
         """(P, N) float64 in [0, 1], invalid trials left out; NaN where no trial is valid."""
         return _ratio(self.successes, self.trials - self.invalid)
 
+    @cached_property
+    def by_infrastructure(self) -> np.ndarray:
+        """(P, N) int: trials that a simulator or a machine ended."""
+        found = np.zeros(self.trials.shape, int)
+        for place, rows in self.rows.items():
+            found[place] = sum(Outcome(r.outcome).infrastructure for r in rows)
+        return found
+
+    @cached_property
+    def reached_rates(self) -> np.ndarray:
+        """(P, N) float64 in [0, 1], trials that infrastructure ended left out; NaN where none is left."""
+        return _ratio(self.successes, self.trials - self.by_infrastructure)
+
     def labels(self, name: str) -> np.ndarray:
         """(N,) str: one label of every scenario, by the name of its field."""
         return np.array([getattr(s, name) for s in self.scenarios], dtype=str)

@@ -15,7 +15,7 @@ from lerobot_roborecover.analysis.estimators import (
     scenario_rates,
 )
 from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
-from lerobot_roborecover.scenario import DeviationType, Stage, Start
+from lerobot_roborecover.scenario import DeviationType, Outcome, Stage, Start
 
 UNDERPOWERED_BELOW = 10
 """Scenarios of a cell below which its numbers are marked."""
@@ -53,6 +53,8 @@ class StartSummary:
     macro: Estimate
     invalid: Mapping[str, int]
     """Trials by invalid outcome; they count as failures in the rates."""
+    without_infrastructure: Estimate | None
+    """RSR without the trials that a simulator or a machine ended; None where there are none."""
     cells: tuple[CellSummary, ...]
     """Occupied cells, in the order of the paper's stages and types."""
 
@@ -97,8 +99,17 @@ def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None
         rsr=rate_estimate(scenarios.rates, scenarios.units),
         macro=rate_estimate(scenarios.rates, scenarios.units, scenarios.cells),
         invalid=invalid_counts(rows),
+        without_infrastructure=_without_infrastructure(rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
     )
+
+
+def _without_infrastructure(rows: Sequence[Mapping[str, Any]]) -> Estimate | None:
+    left = [r for r in rows if not Outcome(r["outcome"]).infrastructure]
+    if len(left) == len(rows) or not left:
+        return None
+    scenarios = scenario_rates(left)
+    return rate_estimate(scenarios.rates, scenarios.units)
 
 
 def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
@@ -155,6 +166,9 @@ def format_table(summary: Summary) -> str:
         if part.invalid:
             reasons = ", ".join(f"{count} {name}" for name, count in part.invalid.items())
             lines.append(f"\nInvalid trials from {start.value} starts, counted as failures: {reasons}")
+        if part.without_infrastructure is not None:
+            rate = _rate(part.without_infrastructure).strip()
+            lines.append(f"Without those that infrastructure ended: {rate}")
     return "\n".join(line.rstrip() for line in lines)
 
 

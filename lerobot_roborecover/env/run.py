@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.trial import Trial
-from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow
+from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow, check_retry
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.robot_fingerprint import (
     NAME,
@@ -86,6 +87,21 @@ class Run:
         if self.log is None:
             raise RuntimeError("this run keeps no trial log")
         return self.log
+
+    def retry(self, outcomes: Sequence[str]) -> tuple[int, Path]:
+        """Takes the log's trials of these outcomes out, so that they run again.
+
+        Args:
+            outcomes: invalid ones.
+
+        Returns:
+            How many they are, and the file beside the log that keeps their rows.
+        """
+        log = self.kept_log()
+        beside = log.path.with_name(f"{log.path.name}.retried.jsonl")
+        if not isinstance(log, TrialLog):
+            raise RuntimeError(f"the rows of {log.path} are kept with things that would not go with them")
+        return log.set_aside(check_retry(outcomes), beside, self.protocol.config_hash()), beside
 
     def rows(self) -> list[TrialRow]:
         """The log's rows of this run's protocol."""

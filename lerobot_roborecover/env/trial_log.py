@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import typing
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -28,11 +28,12 @@ from lerobot_roborecover.env.trial_check import (
     RowChecker,
     parse_json,
 )
-from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.journal import AppendOnly, InUseError, complete_lines
+from lerobot_roborecover.errors import OptionError, RoboRecoverError
+from lerobot_roborecover.journal import AppendOnly, InUseError, append_records, complete_lines
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
+from lerobot_roborecover.whole import write_whole
 
 
 class TrialLogError(RoboRecoverError, ValueError):
@@ -343,6 +344,25 @@ def read_trial_log(path: Path) -> list[TrialRow]:
     return list(read_log(path).rows)
 
 
+def check_retry(outcomes: Iterable[str]) -> frozenset[str]:
+    """Outcomes whose trials are to run again.
+
+    Args:
+        outcomes: of `--retry`.
+
+    Raises:
+        OptionError: one is unknown, or of trials that count as they are.
+    """
+    found = frozenset(outcomes)
+    for outcome in sorted(found):
+        if outcome not in list(Outcome) or Outcome(outcome).valid:
+            raise OptionError(
+                f"--retry {outcome!r:.40}: not one of {[o.value for o in Outcome if not o.valid]}; trials "
+                "that are valid are never run again"
+            )
+    return found
+
+
 class Finished(NamedTuple):
     """How a trial of the log ended; all that a run remembers of its rows."""
 
@@ -415,6 +435,30 @@ class TrialLog:
             raise TrialLogError(f"trial {row.trial} of {row.scenario_id} is already in {self.path}")
         self._file.append(json.dumps(asdict(row), allow_nan=False).encode())
         self._remember(row)
+
+    def set_aside(self, outcomes: Collection[str], to: Path, config_hash: str = "") -> int:
+        """Takes rows of invalid outcomes out, so that their trials run again; they are kept in another file.
+
+        Args:
+            outcomes: which; see `check_retry`.
+            to: the file that gets their rows, after those that it holds.
+            config_hash: of one protocol; empty takes all.
+
+        Returns:
+            How many rows these are.
+        """
+        rows = self.rows
+        gone = [r for r in rows if r.outcome in outcomes and config_hash in ("", r.config_hash)]
+        if gone:
+            out = {r.key() for r in gone}
+            kept = [r for r in rows if r.key() not in out]
+            append_records(to, *map(asdict, gone))
+            self._file.close()
+            write_whole(self.path, "".join(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept))
+            self._file = AppendOnly(self.path)
+            for key in out:
+                del self._done[key]
+        return len(gone)
 
     def _remember(self, row: TrialRow) -> None:
         self._done[tuple(sys.intern(p) if isinstance(p, str) else p for p in row.key())] = Finished(

@@ -12,6 +12,11 @@ class PolicyError(RuntimeError):
     """The policy raised, or what it gave cannot be executed."""
 
 
+class PolicyAwayError(PolicyError):
+    """The way to the policy is lost, or what it remembered of the trial: nothing is known of what it would
+    have done, and the trial is to be run again."""
+
+
 class ReplicaLostError(RuntimeError):
     """The process that held the policy is gone, and the history of its trials with it."""
 
@@ -43,7 +48,8 @@ class Host(Protocol):
         instructions: Sequence[str],
         histories: Sequence[Any],
     ) -> list[Chunk | PolicyError]:
-        """One chunk of actions per waiting slot; an error in its place where the policy raised for it."""
+        """One chunk of actions per waiting slot; an error in its place where the policy raised for it, or
+        cannot be reached (`PolicyAwayError`)."""
 
 
 @runtime_checkable

@@ -105,11 +105,17 @@ class PolicyHost:
         alone = not self.batched or self.max_batch == 1
         return "per_trial" if alone or self._noise != "inside" else "per_batch"
 
-    def start(self, seed: int | None) -> History:
-        """Fresh history for a trial.
+    @property
+    def resumable(self) -> bool:
+        """Whether a trial's history follows from its seed and the number of its inferences."""
+        return self.batched and self._noise in ("none", "fixed", "argument")
+
+    def start(self, seed: int | None, step: int = 0) -> History:
+        """Fresh history for a trial, or one that goes on where another host lost it.
 
         Args:
             seed: the trial's; None where the run has none.
+            step: inferences that the trial has had; 0 unless `resumable`.
         """
         history = History(None)
         if seed is not None:
@@ -119,6 +125,9 @@ class PolicyHost:
         if not self.batched:
             history.policy = self._idle.pop() if self._idle else sharing_weights(self._policy)
             history.policy.reset()
+        if step and self._noise == "argument" and history.stream is not None:
+            for _ in range(step):
+                self._draw(history)
         return history
 
     def finish(self, history: History) -> None:

@@ -20,8 +20,15 @@ from websockets.exceptions import (
 )
 from websockets.sync.client import ClientConnection, connect
 
-from lerobot_roborecover.remote.errors import RemoteError, ServerAwayError, ServerRefusedError, WireError
+from lerobot_roborecover.remote.errors import (
+    RemoteError,
+    ServerAwayError,
+    ServerRefusedError,
+    SessionGoneError,
+    WireError,
+)
 from lerobot_roborecover.remote.protocol import pack, unpack
+from lerobot_roborecover.remote.sessions import SessionLostError
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +37,8 @@ _ATTEMPTS = 3
 """The first may find a connection that the server closed after its last error, as openpi's does."""
 _FIRST_DELAY_S, _LONGEST_DELAY_S = 0.1, 5.0
 _SHOWN = 2000
+_SESSION_LOST = f"{SessionLostError.__name__}: "
+"""How a `roborecover serve` begins the words about a session that it does not know."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +96,7 @@ class Connection:
         Raises:
             ServerAwayError: no connection, lost again and again, or no answer in time.
             ServerRefusedError: the answer is an error text.
+            SessionGoneError: the server has forgotten the request's session.
             WireError: the answer is no message of the protocol, or too large.
         """
         messages = [pack(m) for m in (request.prelude, request.payload) if m is not None]
@@ -111,6 +121,8 @@ class Connection:
                     raise ServerAwayError(
                         f"{self._options.url} closed the connection {attempt} times at this request: {err}"
                     ) from err
+                if attempt > 1:  # at first it may only have been an old connection
+                    self._closing.wait(_FIRST_DELAY_S * 4**attempt)
             except OSError as err:
                 self.close()
                 if attempt == _ATTEMPTS:
@@ -135,6 +147,8 @@ class Connection:
                 "(--policy.timeout_s)"
             ) from err
         if isinstance(answer, str):
+            if answer.startswith(_SESSION_LOST):
+                raise SessionGoneError(f"the server reports: {answer.removeprefix(_SESSION_LOST)[:500]}")
             raise ServerRefusedError(f"the server reports an error: {_gist(answer)}")
         return unpack(answer, "the server's answer")
 

@@ -21,5 +21,9 @@ class ServerAwayError(RemoteError):
     """Nobody answers: no connection, a lost one, or silence."""
 
 
+class SessionGoneError(RemoteError):
+    """The server was started again, and with it the trial's history is gone."""
+
+
 class ServerRefusedError(RemoteError):
     """The server answered with an error in words."""

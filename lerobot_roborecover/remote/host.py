@@ -10,8 +10,8 @@ import torch
 from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
-from lerobot_roborecover.policies.host import Chunk, PolicyError
-from lerobot_roborecover.remote.errors import RemoteError
+from lerobot_roborecover.policies.host import Chunk, PolicyAwayError, PolicyError
+from lerobot_roborecover.remote.errors import RemoteError, ServerAwayError, SessionGoneError
 from lerobot_roborecover.remote.modeling_remote import RemotePolicy, Slot, split
 
 
@@ -73,11 +73,17 @@ class RemoteHost:
             chunks = [c if isinstance(c, RemoteError) else c[None] for c in chunks]
         else:
             chunks = self._policy.ask(frames, tasks, histories)
-        return [PolicyError(str(c)) if isinstance(c, RemoteError) else self._executable(c) for c in chunks]
+        return [_error(c) if isinstance(c, RemoteError) else self._executable(c) for c in chunks]
 
     def _executable(self, chunk: np.ndarray) -> np.ndarray:
         action = self._env_post({ACTION: torch.from_numpy(chunk)})[ACTION]
         return action.to("cpu").numpy()
+
+
+def _error(problem: RemoteError) -> PolicyError:
+    """What a request's failure says of the policy: nothing, where it never got there."""
+    away = isinstance(problem, ServerAwayError | SessionGoneError)
+    return (PolicyAwayError if away else PolicyError)(str(problem))
 
 
 def _stack(observations: list[Any]) -> Any:

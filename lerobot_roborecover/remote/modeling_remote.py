@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from lerobot_roborecover.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.remote.connection import Request, Server, ServerOptions
-from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError
+from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError, SessionGoneError
 from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
 from lerobot_roborecover.remote.sessions import ENVELOPE, PROTOCOL
@@ -109,10 +109,14 @@ class RemotePolicy(PreTrainedPolicy):
         self._slots = None
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """(B, A) actions; NaN, which no simulator is sent, for a trial whose request failed.
+        """(B, A) actions; NaN, which no simulator is sent, for a trial whose request was refused.
 
         At batch 1 a trial's noise starts, on a `roborecover serve`, from torch's seed: what the policy would
         draw here.
+
+        Raises:
+            ServerAwayError, SessionGoneError: the server, or its memory of a trial, is lost. That is no
+                failure of the policy: the evaluation stops, and goes on with the same command.
         """
         observations, tasks = split(batch)
         if self._slots is None or len(self._slots) != len(observations):
@@ -121,6 +125,9 @@ class RemotePolicy(PreTrainedPolicy):
             self._slots = [self.open_slot((seed + i) % 2**63) for i in range(len(observations))]
         width = self.config.output_features[ACTION].shape[0]
         actions = self.advance(observations, tasks, self._slots)
+        for action in actions:
+            if isinstance(action, ServerAwayError | SessionGoneError):
+                raise action
         rows = [np.full(width, np.nan, np.float32) if isinstance(a, RemoteError) else a for a in actions]
         return torch.from_numpy(np.stack(rows))
 

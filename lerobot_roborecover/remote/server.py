@@ -185,15 +185,15 @@ class PolicyServer:
         options, tls = self._options, self._options.tls()
         self._batcher = Batcher(self._policy, options.batch_delay_s, lambda: self._connections)
 
-        async def start(seed: int | None) -> Any:
+        async def start(seed: int | None, step: int) -> Any:
             return await self._batcher.call(
-                self._policy.start, secrets.randbits(63) if seed is None else seed
+                self._policy.start, secrets.randbits(63) if seed is None else seed, step
             )
 
         async def finish(history: Any) -> None:
             await self._batcher.call(self._policy.finish, history)
 
-        self._sessions = Sessions(start, finish, options.max_sessions)
+        self._sessions = Sessions(start, finish, options.max_sessions, self._policy.resumable)
         if stop is None:
             stop = asyncio.Event()
             _stop_on_signals(stop)
@@ -284,7 +284,7 @@ class PolicyServer:
             raise RequestError(f"the instruction is {task!r:.100}; give 'task' or 'prompt' as a text")
         session = await self._sessions.get(envelope)
         async with session.busy:
-            if envelope.step is not None and envelope.step == session.answered - 1:
+            if envelope.step is not None and envelope.step == session.answered - 1 and session.last:
                 return session.last
             if envelope.step is not None and envelope.step != session.answered:
                 raise RequestError(

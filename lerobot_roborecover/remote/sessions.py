@@ -1,9 +1,10 @@
 """Sessions: how a server that keeps histories tells trials apart, whatever connection they come by.
 
 A request may hold an envelope, `{"session": name, "seed": noise seed, "step": requests answered before}`. The
-step makes a repeated request harmless: it gets the answer it has had. `"end": true` ends the session, with or
-without a last observation. Without an envelope a connection is a session of its own, as openpi's clients
-expect, and `{"reset": true}` begins it anew.
+step makes a repeated request harmless: it gets the answer it has had. A session that the server has lost goes
+on from its seed and step where the policy keeps nothing else. `"end": true` ends the session, with or without
+a last observation. Without an envelope a connection is a session of its own, as openpi's clients expect, and
+`{"reset": true}` begins it anew.
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ PROTOCOL = 1
 
 class RequestError(RemoteError):
     """A request that cannot be served; its text goes back to the client."""
+
+
+class SessionLostError(RequestError):
+    """The server knows nothing of a session's earlier requests."""
 
 
 @dataclass(frozen=True)
@@ -75,17 +80,20 @@ class Sessions:
     """The open sessions; the one unused for longest gives way when there are too many.
 
     Args:
-        start: makes a history from a noise seed.
+        start: makes a history from a noise seed and the requests that it has had.
         finish: gives it back.
         limit: open at once, at most.
+        resumable: whether `start` can go on where a session that is lost has been.
     """
 
     def __init__(
         self,
-        start: Callable[[int | None], Awaitable[Any]],
+        start: Callable[[int | None, int], Awaitable[Any]],
         finish: Callable[[Any], Awaitable[None]],
         limit: int,
+        resumable: bool = False,
     ):
+        self._resumable = resumable
         self._start, self._finish, self._limit = start, finish, limit
         self._open: OrderedDict[str, Session] = OrderedDict()
 
@@ -96,19 +104,20 @@ class Sessions:
         """The session of a request, opened if it is the first.
 
         Raises:
-            RequestError: the session is not known, and has had requests before.
+            SessionLostError: the session is not known, and has had requests before that matter.
         """
         session = self._open.get(envelope.session)
         if session is None:
-            if envelope.step:
-                raise RequestError(
+            if envelope.step and not (self._resumable and envelope.seed is not None):
+                raise SessionLostError(
                     f"session {envelope.session!r} is not open, and had {envelope.step} requests: the server "
                     "was started again, or has more trials at once than --max_sessions"
                 )
             while len(self._open) >= self._limit and (idle := self._idle()) is not None:
                 await self.end(idle)
-            history = await self._start(envelope.seed)
-            session = self._open.setdefault(envelope.session, Session(history))
+            step = envelope.step or 0
+            history = await self._start(envelope.seed, step)
+            session = self._open.setdefault(envelope.session, Session(history, step))
         self._open.move_to_end(envelope.session)
         return session
 

@@ -20,7 +20,7 @@ from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.env.trial_log import TrialRow, trial_key
-from lerobot_roborecover.policies.host import PolicyError, Replica, ReplicaLostError
+from lerobot_roborecover.policies.host import PolicyAwayError, PolicyError, Replica, ReplicaLostError
 from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
@@ -83,7 +83,9 @@ class Engine:
         self._queue = UnitQueue(())
         self._finished = 0
         self.reruns = 0
-        """Trials that were begun again because a machine was lost."""
+        """Trials that were begun again because a machine was lost, or the way to the policy."""
+        self.unrun: dict[tuple[str, int], str] = {}
+        """Why trials were left for another run, by scenario and trial: the policy could not be reached."""
 
     def run(self, units: Sequence[Unit[TrialStart]], stop: Callable[[], bool] = lambda: False) -> int:
         """Runs all units that the log does not hold yet.
@@ -231,6 +233,9 @@ class Engine:
         self._inference_s[replica].append(seconds)
         for sitting, chunk in zip(asked, chunks, strict=True):
             trial, slot = sitting.trial, sitting.seat.slot
+            if isinstance(chunk, PolicyAwayError):
+                self._away(sitting, str(chunk))
+                continue
             if isinstance(chunk, PolicyError):
                 trial.refused(chunk, seconds=seconds)
             else:
@@ -266,12 +271,29 @@ class Engine:
 
     def _lost(self, sitting: Sitting, reason: str) -> None:
         """The trial's machine is gone: it is run again from its start, elsewhere."""
-        key = (sitting.unit.scenario.id, sitting.unit.trial)
-        self._losses[key] = self._losses.get(key, 0) + 1
-        if self._losses[key] >= PARK_AFTER:
+        if self._lost_again(sitting):
             sitting.trial.fail(Outcome.SIM_ERROR, f"lost {PARK_AFTER} times, last: {reason}")
             self._finish(sitting)
             return
+        self._run_again(sitting)
+
+    def _away(self, sitting: Sitting, reason: str) -> None:
+        """Nobody could ask the policy, so nothing is known of it: the trial is run again from its start, and
+        in the end left without a row, for a run that finds the policy there."""
+        unit = sitting.unit
+        if self._lost_again(sitting):
+            self.unrun[unit.scenario.id, unit.trial] = reason
+            self._leave(sitting)
+        else:
+            self._run_again(sitting)
+
+    def _lost_again(self, sitting: Sitting) -> bool:
+        """Counts a loss; whether it was one too many."""
+        key = (sitting.unit.scenario.id, sitting.unit.trial)
+        self._losses[key] = self._losses.get(key, 0) + 1
+        return self._losses[key] >= PARK_AFTER
+
+    def _run_again(self, sitting: Sitting) -> None:
         self.reruns += 1
         self._queue.put_back(sitting.unit)
         self._leave(sitting)

@@ -27,7 +27,7 @@ from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.render_device import egl_devices, render_environment
 from lerobot_roborecover.env.run import Run, group_name, open_run
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_log import TrialRow, check_retry
 from lerobot_roborecover.trials.engine import Engine, units_of
 from lerobot_roborecover.trials.load import HostSpec, load_host
 from lerobot_roborecover.trials.local import open_local_engine
@@ -36,6 +36,7 @@ from lerobot_roborecover.trials.sequential import ALONE, open_watch
 from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
 from lerobot_roborecover.trials.units import OrderedQueue, Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
+from lerobot_roborecover.words import counted
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ ALIASES = {
     "limit-seconds": "runner.limit_seconds",
     "sequential": "runner.sequential",
     "shard": "env.shard",
+    "retry": "runner.retry",
 }
 """Short names of options that this command has and `lerobot-eval` does not."""
 
@@ -79,9 +81,17 @@ class RunnerOptions:
     sequential: str = ""
     """A trial log to compare with while the run goes: it stops as soon as the comparison is decided. `alone`
     compares with nobody, and shows an interval that holds whenever it is looked at."""
+    retry: str = ""
+    """Run trials of these outcomes again (`policy_error,timeout,sim_error`); their old rows are kept beside
+    the trial log, in `<log>.retried.jsonl`."""
     portable: bool = False
     """Compute a diffusion policy's noise schedule in float64, so that its roots round alike on every
     processor; the last bit of its actions then differs from `lerobot-eval`'s."""
+
+    @property
+    def retried(self) -> list[str]:
+        """Outcomes of `retry`."""
+        return [outcome.strip() for outcome in self.retry.split(",") if outcome.strip()]
 
     def check(self) -> None:
         """Refuses what cannot be used.
@@ -91,6 +101,7 @@ class RunnerOptions:
         """
         if self.engine not in ENGINES:
             raise OptionError(f"--runner.engine={self.engine}: not one of {list(ENGINES)}")
+        check_retry(self.retried)
         for name, low, high in (
             ("slots", 0, 4096),
             ("max_batch", 1, 4096),
@@ -181,6 +192,9 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
+    if cfg.runner.retried:
+        again, beside = run.retry(cfg.runner.retried)
+        print(f"{counted(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)
     run.pool.acquire()
     stopper = Stopper(cfg.runner.limit_seconds)
     try:
@@ -205,7 +219,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             line.show(tally)
             settled()
 
-        videos = None
+        videos, unrun = None, {}
         if cfg.runner.videos:
             ids = [s.id for s in scenarios]
             videos = VideoKeeper(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
@@ -217,7 +231,9 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
                 "queue_of": UnitQueue if watch is None else OrderedQueue,
             }  # fmt: skip
             make = _ray_engine if cfg.runner.engine == "ray" else _local_engine
-            make(cfg, run, units, options).run(units, stopper)
+            engine = make(cfg, run, units, options)
+            engine.run(units, stopper)
+            unrun = engine.unrun
         line.show(tally, final=True)
         if watch is not None:
             record = watch.record(log.path)
@@ -233,6 +249,15 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
                 file=sys.stderr,
             )
             return 130 if stopper.reason == "interrupted" else 0
+        if unrun:
+            (scenario, trial), reason = next(iter(unrun.items()))
+            print(
+                f"{counted(len(unrun), 'trial')} could not be run, and left no row: the policy was away "
+                f"(trial {trial} of {scenario}: {reason}). Once it is back, run the same command with "
+                f"--env.trial_log={log.path} --output_dir={out}",
+                file=sys.stderr,
+            )
+            return 1
         return 0
     finally:
         stopper.restore()

@@ -49,7 +49,7 @@ def status(url, **headers):
 class Cameras:
     """Two pictures, or one: what the policy makes of a picture is its mean."""
 
-    max_batch, horizon, action_width = 8, 1, 2
+    max_batch, horizon, action_width, resumable = 8, 1, 2, False
 
     def __init__(self):
         self.batches: list[list[tuple[str, ...]]] = []
@@ -65,7 +65,7 @@ class Cameras:
 
         return ServedPolicy.company(self, observation)
 
-    def start(self, seed):
+    def start(self, seed, step=0):
         return seed
 
     def finish(self, history):

@@ -217,7 +217,7 @@ def test_who_has_no_key_stays_out(checkpoints, monkeypatch, tmp_path):
 def test_sessions_beyond_the_limit_end_the_oldest():
     ended = []
 
-    async def start(seed):
+    async def start(seed, step):
         return seed
 
     async def finish(history):
@@ -234,6 +234,15 @@ def test_sessions_beyond_the_limit_end_the_oldest():
             await sessions.get(Envelope("b", 1, step=3))
 
     asyncio.run(use())
+
+    async def go_on():
+        sessions = Sessions(start, finish, 2, resumable=True)
+        session = await sessions.get(Envelope("b", 1, step=3))
+        assert (session.answered, session.history) == (3, 1)
+        with pytest.raises(RequestError, match="not open"):
+            await sessions.get(Envelope("c", None, step=3))
+
+    asyncio.run(go_on())
     assert read_envelope({}, "own") == Envelope("own")
 
 

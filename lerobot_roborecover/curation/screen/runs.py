@@ -10,6 +10,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,8 @@ from lerobot_roborecover.curation.policy_trials import (
     run_trials,
 )
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_log import TrialLog, read_trial_log
-from lerobot_roborecover.journal import append_records
-from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.env.trial_log import TrialLog, check_retry
+from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_file, write_whole
 
 POLICY_FILE = "policy.json"
@@ -284,19 +284,8 @@ def forget_trials(folder: Path, outcomes: Sequence[str]) -> int:
     Raises:
         OptionError: an outcome is unknown or valid.
     """
-    for outcome in outcomes:
-        if outcome not in list(Outcome) or Outcome(outcome).valid:
-            raise OptionError(
-                f"--retry {outcome!r:.40}: not one of {[o.value for o in Outcome if not o.valid]}; trials "
-                "that are valid are never run again"
-            )
-    path = folder / TRIALS_FILE
+    chosen, path = check_retry(outcomes), folder / TRIALS_FILE
     if not path.exists():
         return 0
-    TrialLog(path).close()  # nobody else has it open, and a line that a crash cut off is gone
-    rows = read_trial_log(path)
-    kept, gone = ([r for r in rows if (r.outcome in outcomes) is out] for out in (False, True))
-    if gone:
-        append_records(folder / RETRIED_FILE, *map(asdict, gone))
-        write_whole(path, "".join(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept))
-    return len(gone)
+    with closing(TrialLog(path)) as log:
+        return log.set_aside(chosen, folder / RETRIED_FILE)
