@@ -61,7 +61,7 @@ def _slack(line) -> float:
     return 3 * math.sqrt(share * (1 - share) / line.samples)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_cross_fitted_choices_and_monitors_are_covered(benchmark, monkeypatch):
     for module in (benchmark.settings, benchmark.labels):
         monkeypatch.setattr(module, "SIZES", (20,))
@@ -70,6 +70,7 @@ def test_cross_fitted_choices_and_monitors_are_covered(benchmark, monkeypatch):
         assert not [line for line in lines if benchmark.too_far([line], slack=_slack(line))]
 
 
+@pytest.mark.nightly
 def test_runs_and_looks_are_covered(benchmark, monkeypatch):
     monkeypatch.setattr(benchmark.settings, "SIZES", (20,))
     monkeypatch.setattr(benchmark.several, "RUNS", (3,))

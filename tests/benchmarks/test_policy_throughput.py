@@ -34,7 +34,9 @@ BACKBONE = {
 @pytest.mark.parametrize(
     ("kind", "changes"),
     [
-        ("pi05", {"image_resolution": [32, 32], "num_inference_steps": 2}),
+        pytest.param(
+            "pi05", {"image_resolution": [32, 32], "num_inference_steps": 2}, marks=pytest.mark.nightly
+        ),
         (
             "smolvla",
             {"resize_imgs_with_padding": [32, 32], "num_steps": 2, "num_vlm_layers": 2,

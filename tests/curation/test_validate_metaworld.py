@@ -61,7 +61,7 @@ def recording(simulator, index: int, every: int, spoilt: bool) -> Recording:
 @pytest.mark.metaworld
 @pytest.mark.render
 @pytest.mark.lerobot
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_frames_of_the_video(tmp_path):
     simulator = make_simulator("metaworld", **FILM)
     recordings = (recording(simulator, i, 1 + i % 2, spoilt=i == 2) for i in range(3))

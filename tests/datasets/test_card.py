@@ -79,6 +79,7 @@ def test_frames_of_the_fingerprint_make_the_grid_of_the_card(hub, client, tmp_pa
     assert "assets/recovery_frames.png" not in hub.repos[REPO].commits[commit_of(bare)]
 
 
+@pytest.mark.nightly
 def test_pictures_are_rendered_for_the_card_where_the_dataset_has_none(hub, client, local):
     plain = client.publish(local)
     assert "assets/recovery_frames.png" not in hub.repos[REPO].commits[commit_of(plain)]

@@ -190,6 +190,7 @@ def test_a_dataset_with_episodes_is_published_for_lerobot_and_pulled_whole(hub, 
 
 
 @pytest.mark.lerobot
+@pytest.mark.nightly
 def test_a_trajectory_dataset_has_a_card_of_its_own(hub, client, tmp_path):
     from lerobot_roborecover.datasets.trajectories import read_trajectories
     from lerobot_roborecover.datasets.trajectory_write import write_trajectories

@@ -258,7 +258,7 @@ def test_parsing_imports_neither_lerobot_nor_torch():
 
 
 @pytest.mark.lerobot
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_everything_on_this_machine_that_can_be_had_offline(monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     checks = {check.name: check for check in doctor.examine("metaworld")}

@@ -120,7 +120,13 @@ def told(rows):
     }
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode",
+    [
+        m if m in ("direct", "monitor_correction") else pytest.param(m, marks=pytest.mark.nightly)
+        for m in MODES
+    ],
+)
 def test_the_same_rows_as_lerobots_rollout(dataset, checkpoints, monitor, tmp_path, mode):
     """With a correction policy that has an observation queue and draws noise."""
     made = composite(checkpoints, mode)

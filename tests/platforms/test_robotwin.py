@@ -94,7 +94,7 @@ def test_every_task_has_code_and_an_official_limit(simulator):
     "name", [n if n == TASKS[0] else pytest.param(n, marks=pytest.mark.nightly) for n in TASKS]
 )
 def test_replays_are_bit_identical_in_this_process_and_in_a_fresh_one(simulator, name, tmp_path):
-    steps = 200 if REAL or name == "stack_blocks_two" else 40
+    steps = 200 if REAL else 40
     task, other = task_of(name), task_of(TASKS[1] if name == TASKS[0] else TASKS[0])
     simulator.reset(task, Reset(seed=4))
     first = simulator.bodies()
