@@ -24,9 +24,10 @@ def headline(results: Results) -> str:
     ]
     if lost := int(results.ranked.by_infrastructure[best].sum()):
         reached = float(np.nanmean(results.ranked.reached_rates[best]))
+        as_what = "counts as a failure" if lost == 1 else "count as failures"
         sentences.append(
-            f"{counted(lost, 'trial')} of it ended with a simulator or a machine and counts as a failure; "
-            f"without, {100 * reached:.1f} %."
+            f"{counted(lost, 'trial')} of it ended with a simulator or a machine and {as_what}; without, "
+            f"{100 * reached:.1f} %."
         )
     if results.several_runs:
         sentences.append(_method(results, name))

@@ -34,7 +34,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("cells", "cells", ("cells", "sources", "suites")),
     ("sources", "source_matrix", ("source_matrix",)),
     ("oracle", "oracle", ("oracle",)),
-    ("time", "time_to_recover", ("budgets",)),
+    ("time", "time_to_recover", ("budgets", "trial_metrics")),
     ("interventions", "interventions", ("interventions",)),
     ("outcomes", "outcomes", ("outcomes",)),
     ("uncertainty", "", ("variance",)),

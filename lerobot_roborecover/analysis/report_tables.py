@@ -23,6 +23,7 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
 from lerobot_roborecover.analysis.timing import FRACTIONS, budget_estimates, median_steps
+from lerobot_roborecover.analysis.trial_metrics import trial_metrics
 from lerobot_roborecover.analysis.units import ESTIMAND, Unit
 from lerobot_roborecover.analysis.variance import variance_split
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
@@ -49,7 +50,9 @@ def all_tables(results: Results) -> list[Table]:
         tables.append(sources_by_policy(results))
     if len(results.recovery.arms) > 1:
         tables.append(oracle_table(results))
-    tables += [budgets(results), variance(results)]
+    tables += [
+        budgets(results), trial_metrics(results.recovery, results.draws), variance(results)
+    ]  # fmt: skip
     if results.costs:
         tables.append(interventions(results))
     if published.policies(results.study.platform):

@@ -31,10 +31,9 @@ class RemoteConfig(PreTrainedConfig):
     wait_s: float = 300.0
     """For the server to come up, before its first answer."""
     reconnect_s: float = 60.0
-    """For a lost server to come back; then the trials that wait for it are `policy_error` rows."""
+    """For a lost server to come back; then the trials that wait for it are begun again."""
     give_up_after: int = 3
-    """Times in a row that nobody answered after which the run stops, so that a night without a server does
-    not fill the log with errors; 0 never stops."""
+    """Times in a row that nobody answered after which the run stops; 0 never stops."""
     max_frame_mb: int = 64
     """Of an answer."""
 

@@ -66,6 +66,7 @@ def test_everything_is_written(written):
         "source_matrix",
         "oracle",
         "budgets",
+        "trial_metrics",
         "variance",
         "published",
     } <= names

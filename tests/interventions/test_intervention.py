@@ -27,6 +27,7 @@ pytestmark = pytest.mark.lerobot
 
 TRIALS = 2
 MODES = ("direct", "reversion", "correction", "monitor_reversion", "monitor_correction", "human")
+BRIEF_MODES = ("direct", "monitor_correction")
 
 
 @pytest.fixture(scope="module")
@@ -122,10 +123,7 @@ def told(rows):
 
 @pytest.mark.parametrize(
     "mode",
-    [
-        m if m in ("direct", "monitor_correction") else pytest.param(m, marks=pytest.mark.nightly)
-        for m in MODES
-    ],
+    [*BRIEF_MODES, *(pytest.param(m, marks=pytest.mark.nightly) for m in MODES if m not in BRIEF_MODES)],
 )
 def test_the_same_rows_as_lerobots_rollout(dataset, checkpoints, monitor, tmp_path, mode):
     """With a correction policy that has an observation queue and draws noise."""

@@ -1,0 +1,63 @@
+"""Metrics of trials, and rates without the trials that infrastructure ended."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from lerobot_roborecover.analysis.headline import headline
+from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.results import analyse
+from lerobot_roborecover.analysis.summary import format_table, summarise
+from lerobot_roborecover.analysis.trial_metrics import METRICS, metric_estimates, scenario_means
+from lerobot_roborecover.scenario import Outcome, Start
+from tests.support.trial_rows import three_policies, write_log
+
+
+def rows_of(results, p):
+    return [row for (arm, _), rows in results.recovery.rows.items() if arm == p for row in rows]
+
+
+def test_means_are_those_of_scenarios_means(tmp_path):
+    results = analyse(read_study(three_policies(tmp_path, count=12)))
+    used, steps = METRICS
+    for p in range(len(results.recovery.arms)):
+        by_scenario: dict[str, list] = {}
+        for row in rows_of(results, p):
+            by_scenario.setdefault(row.scenario_id, []).append(row)
+        expected = np.mean([np.mean([r.steps / r.horizon for r in rows]) for rows in by_scenario.values()])
+        found = metric_estimates(results.recovery, used, results.draws)[p]
+        assert math.isclose(found.value, expected)
+        assert 0 <= found.low <= found.value <= found.high <= 1
+        means = scenario_means(results.recovery, steps)[:, p]
+        solved = [[r.steps for r in rows if r.success] for _, rows in sorted(by_scenario.items())]
+        np.testing.assert_allclose(means, [np.mean(s) if s else np.nan for s in solved])
+
+
+def test_what_infrastructure_ended_is_left_out_beside_the_headline(tmp_path):
+    (path, *others) = three_policies(tmp_path, count=12)
+    study = read_study([path, *others])
+    best = analyse(study).best_first[0]
+    name = analyse(study).ranked.arms[best]
+    (arm,) = [a for a in study.arms if a.policy == name and a.start is Start.RECOVERY]
+    broken = [
+        replace(row, outcome="sim_error", success=False, reason="it crashed") if n % 20 == 0 else row
+        for n, row in enumerate(arm.rows)
+    ]
+    lost = [row for row in broken if Outcome(row.outcome).infrastructure]
+    again = write_log(tmp_path / "broken.jsonl", broken)
+    results = analyse(read_study([f"broken={again}"]))
+    assert f"{len(lost)} trials of it ended with a simulator or a machine and count" in headline(results)
+    summary = summarise([asdict(row) for row in broken]).starts[Start.RECOVERY]
+    left = [row for row in broken if row not in lost]
+    by_scenario: dict[str, list[bool]] = {}
+    for row in left:
+        by_scenario.setdefault(row.scenario_id, []).append(row.success)
+    assert math.isclose(
+        summary.without_infrastructure.value, np.mean([np.mean(s) for s in by_scenario.values()])
+    )
+    assert "Without those that infrastructure ended" in format_table(summarise([asdict(r) for r in broken]))
+    whole = summarise([asdict(row) for row in left]).starts[Start.RECOVERY]
+    assert whole.without_infrastructure is None
