@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.cli.progress import Progress
     from lerobot_roborecover.curation.monitor_data.judging import judge_dataset
     from lerobot_roborecover.interventions.monitor.errors import MonitorError
+    from lerobot_roborecover.interventions.monitor_interface import TrainedMonitor
     from lerobot_roborecover.interventions.monitor_loading import load_monitor
 
     if args.threshold is not None and args.choose_threshold:
@@ -58,6 +59,10 @@ def run(args: argparse.Namespace) -> int:
         raise MonitorError(f"--threshold={args.threshold}: must be above 0 and below 1")
     overrides = {"base_model": args.base_model} if args.base_model else {}
     monitor = load_monitor(args.monitor, args.device, args.revision, **overrides)
+    if not isinstance(monitor, TrainedMonitor):
+        raise MonitorError(
+            f"{args.monitor} has no record of what it was trained on, which is measured against"
+        )
     judged = []
     for text in args.data:
         name, rest = split_named(text)

@@ -181,7 +181,7 @@ class Director:
         taker = Controller.HUMAN if self._mode == "human" else Controller.CORRECTION
         self._hand_over(episode, taker)
         if taker is Controller.HUMAN:
-            episode.history = self._driver.take(instruction)
+            episode.history = self._person().take(instruction)
         else:
             episode.left = self._correction_steps
         episode.first = Directive(0, taker, told.asked, told.score, told.monitor_s)
@@ -193,7 +193,7 @@ class Director:
         if episode.history is None:
             return
         if episode.controller is Controller.HUMAN:
-            self._driver.leave(episode.history)
+            self._person().leave(episode.history)
         else:
             episode.stream = episode.history.stream
             self.members[episode.controller].finish(episode.history)
@@ -207,9 +207,17 @@ class Director:
             episode.history = self.members[controller].start(None)
             episode.history.stream = episode.stream
 
-    def _driven(self, observation: Observation, instruction: str, episode: Episode) -> Chunk | PolicyError:
+    def _person(self) -> Driver:
+        if self._driver is None:
+            raise RuntimeError(f"mode {self._mode} needs a driver")
+        return self._driver
+
+    def _driven(
+        self, observation: Observation, instruction: str, episode: Episode
+    ) -> Chunk | PolicyError | None:
+        """The person's next action; None where they have handed the slot back."""
         alone = {k: v[0] if isinstance(v, torch.Tensor) else v for k, v in observation.items()}
-        action = self._driver.act(episode.history, alone)
+        action = self._person().act(episode.history, alone)
         if action is None:
             # The queue stays empty: the base policy is asked in the same step.
             self._hand_over(episode, Controller.BASE)

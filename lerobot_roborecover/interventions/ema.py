@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, overload
 
 import torch
 from lerobot.configs.train import TrainPipelineConfig
@@ -40,6 +40,12 @@ class EmaAdamW(torch.optim.AdamW):
         self.defaults["ema_decay"] = ema_decay
         for group in self.param_groups:
             group["ema_decay"] = ema_decay
+
+    @overload
+    def step(self, closure: None = None) -> None: ...
+
+    @overload
+    def step(self, closure: Callable[[], float]) -> float: ...
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:

@@ -92,7 +92,7 @@ def load_member(
                 f"--policy.{role}.n_action_steps={member.n_action_steps}: {member.path} predicts chunks of "
                 f"{limit}"
             )
-        config.n_action_steps = member.n_action_steps
+        vars(config)["n_action_steps"] = member.n_action_steps  # of those that act in chunks, not of the base
     _check(role, member, config, features, action)
     policy = make_policy(config, env_cfg=_own_features(config))
     policy.eval()

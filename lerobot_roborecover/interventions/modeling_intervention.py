@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor
@@ -32,8 +33,10 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
     Actions carry five columns more than the environment's (`env.directives`); its vector env takes them off.
     """
 
-    config_class = RoboRecoverInterventionConfig
-    name = POLICY_TYPE
+    # LeRobot declares both as None, for subclasses to replace.
+    config_class = RoboRecoverInterventionConfig  # ty: ignore[invalid-assignment]
+    name = POLICY_TYPE  # ty: ignore[invalid-assignment]
+    config: RoboRecoverInterventionConfig
 
     def __init__(self, config: RoboRecoverInterventionConfig, **_: Any):
         super().__init__(config)
@@ -137,12 +140,14 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         cls,
         pretrained_name_or_path: str | Path,
         *,
-        config: RoboRecoverInterventionConfig | None = None,
+        config: PreTrainedConfig | None = None,
         **kwargs: Any,
-    ) -> RoboRecoverInterventionPolicy:
+    ) -> Self:
         """Loads the members that a saved composite names."""
         if config is None:
             config = RoboRecoverInterventionConfig.from_pretrained(pretrained_name_or_path, **kwargs)
+        if not isinstance(config, RoboRecoverInterventionConfig):
+            raise OptionError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
         policy = cls(config)
         policy.eval()
         return policy

@@ -52,3 +52,13 @@ class Monitor(Protocol):
                 hold more keys than it reads.
             instructions: B language instructions.
         """
+
+
+@runtime_checkable
+class TrainedMonitor(Monitor, Protocol):
+    """A monitor that knows what it was trained on, as all of ours do."""
+
+    config: Any
+    """Of LeRobot's reward model."""
+    trained_on: Mapping[str, Any]
+    """Scenarios and labels of the training set; empty where they are not known."""

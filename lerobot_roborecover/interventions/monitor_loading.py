@@ -50,11 +50,14 @@ def load_monitor(
         raise MonitorError(f"{file}, with {overrides or 'no overrides'}: {reason}") from None
     config.pretrained_path = str(path)
     cls = get_reward_model_class(config.type)
-    if not hasattr(cls, "judge"):
-        raise MonitorError(
-            f"{path} is a reward model of type {config.type!r}, which does not judge single frames as a "
-            "monitor does; train one with policies/train/monitor_qwen3vl.yaml or monitor_small.yaml"
-        )
+    other = MonitorError(
+        f"{path} is a reward model of type {config.type!r}, which does not judge single frames as a "
+        "monitor does; train one with policies/train/monitor_qwen3vl.yaml or monitor_small.yaml"
+    )
+    if not hasattr(cls, "judge"):  # before it is loaded
+        raise other
     model = cls.from_pretrained(path, config=config, revision=revision)
     model.eval()
+    if not isinstance(model, Monitor):
+        raise other
     return model

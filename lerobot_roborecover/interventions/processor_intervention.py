@@ -29,7 +29,10 @@ def make_roborecover_intervention_pre_post_processors(
         dataset_stats: not used.
     """
     before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
-        steps=[RenameObservationsProcessorStep(rename_map={}), DeviceProcessorStep(device=config.device)],
+        steps=[
+            RenameObservationsProcessorStep(rename_map={}),
+            DeviceProcessorStep(device=str(config.device)),
+        ],
         name=POLICY_PREPROCESSOR_DEFAULT_NAME,
     )
     after = PolicyProcessorPipeline[PolicyAction, PolicyAction](

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.optim.optimizers import OptimizerConfig
 
 from lerobot_roborecover.remote.errors import RemoteError
 
@@ -70,7 +71,7 @@ class RemoteConfig(PreTrainedConfig):
         """None: nothing is trained."""
         return None
 
-    def get_optimizer_preset(self) -> None:
+    def get_optimizer_preset(self) -> OptimizerConfig:
         """Nothing to optimise.
 
         Raises:

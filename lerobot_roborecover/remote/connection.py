@@ -104,10 +104,9 @@ class Connection:
             if self._closing.is_set():
                 raise ServerAwayError("closed")
             try:
-                if self._socket is None:
-                    self.open(budget_s)
+                socket = self.open(budget_s) if self._socket is None else self._socket
                 for message in messages:
-                    answer = self._exchange(message)
+                    answer = self._exchange(socket, message)
                 return answer
             except ConnectionClosed as err:
                 self.close()
@@ -136,10 +135,10 @@ class Connection:
                 f"{self._options.max_frame_bytes / 2**20:g} MB (--policy.max_frame_mb)"
             ) from err
 
-    def _exchange(self, message: bytes) -> Any:
-        self._socket.send(message)
+    def _exchange(self, socket: ClientConnection, message: bytes) -> Any:
+        socket.send(message)
         try:
-            answer = self._socket.recv(timeout=self._options.timeout_s)
+            answer = socket.recv(timeout=self._options.timeout_s)
         except TimeoutError as err:
             self.close()
             raise ServerAwayError(
@@ -152,7 +151,7 @@ class Connection:
             raise ServerRefusedError(f"the server reports an error: {_gist(answer)}")
         return unpack(answer, "the server's answer")
 
-    def open(self, budget_s: float) -> None:
+    def open(self, budget_s: float) -> ClientConnection:
         """Connects, trying for a while, and reads the metadata.
 
         Raises:
@@ -164,11 +163,11 @@ class Connection:
         while True:
             try:
                 # openpi's server does not answer pings while it infers: silence is for `timeout_s` to judge.
-                self._socket = connect(
+                self._socket = socket = connect(
                     options.url, compression=None, max_size=options.max_frame_bytes, ping_interval=None,
                     open_timeout=10, close_timeout=1, additional_headers=headers, proxy=None,
                 )  # fmt: skip
-                first = self._socket.recv(timeout=options.timeout_s)
+                first = socket.recv(timeout=options.timeout_s)
                 break
             except InvalidURI as err:
                 raise RemoteError(f"--policy.url={options.url}: {err}; write ws://HOST:PORT") from err
@@ -199,7 +198,8 @@ class Connection:
             raise WireError(f"the server's metadata is a {type(metadata).__name__}, not a map")
         self.metadata = metadata
         if options.greeting is not None:
-            self._exchange(pack(options.greeting))
+            self._exchange(socket, pack(options.greeting))
+        return socket
 
     def close(self) -> None:
         """Drops the connection; the next request opens another."""

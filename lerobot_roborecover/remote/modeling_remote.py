@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
 from lerobot_roborecover.remote.sessions import ENVELOPE, PROTOCOL
 from lerobot_roborecover.remote.translate import Translator
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.remote.host import RemoteHost
 
 logger = logging.getLogger(__name__)
 
@@ -61,8 +64,10 @@ class RemotePolicy(PreTrainedPolicy):
         RemoteError: no server, not the right one, or a mapping that cannot be used.
     """
 
-    config_class = RemoteConfig
-    name = "remote"
+    # LeRobot declares both as None, for subclasses to replace.
+    config_class = RemoteConfig  # ty: ignore[invalid-assignment]
+    name = "remote"  # ty: ignore[invalid-assignment]
+    config: RemoteConfig
 
     def __init__(self, config: RemoteConfig, **kwargs: Any):
         super().__init__(config)
@@ -123,7 +128,7 @@ class RemotePolicy(PreTrainedPolicy):
             self.reset()
             seed = torch.initial_seed()
             self._slots = [self.open_slot((seed + i) % 2**63) for i in range(len(observations))]
-        width = self.config.output_features[ACTION].shape[0]
+        width = (self.config.output_features or {})[ACTION].shape[0]
         actions = self.advance(observations, tasks, self._slots)
         for action in actions:
             if isinstance(action, ServerAwayError | SessionGoneError):
@@ -142,12 +147,14 @@ class RemotePolicy(PreTrainedPolicy):
         chunks = self.ask(observations, tasks, slots)
         for slot in slots:
             self.close_slot(slot)
+        whole: list[np.ndarray] = []
         for chunk in chunks:
             if isinstance(chunk, RemoteError):
                 raise chunk
-        if len({c.shape for c in chunks}) > 1:
-            raise RemoteError(f"the server gave chunks of different shapes: {[c.shape for c in chunks]}")
-        return torch.from_numpy(np.stack(chunks))
+            whole.append(chunk)
+        if len({c.shape for c in whole}) > 1:
+            raise RemoteError(f"the server gave chunks of different shapes: {[c.shape for c in whole]}")
+        return torch.from_numpy(np.stack(whole))
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
         """Not possible.
@@ -163,7 +170,7 @@ class RemotePolicy(PreTrainedPolicy):
 
     def make_host(
         self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int = 64
-    ) -> Any:
+    ) -> RemoteHost:
         """The policy as `roborecover eval` asks it.
 
         Args:
@@ -310,7 +317,9 @@ class RemotePolicy(PreTrainedPolicy):
 
     def _check_features(self, observation: Mapping[str, np.ndarray]) -> None:
         wanted = self.server.metadata.get("observation")
-        for key, shape in wanted.items() if isinstance(wanted, dict) else ():
+        if not isinstance(wanted, dict):
+            return
+        for key, shape in wanted.items():
             if key not in observation:
                 raise MappingError(
                     f"the policy at {self.config.url} looks at {sorted(wanted)}; the environment gives "

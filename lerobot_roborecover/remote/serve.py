@@ -14,6 +14,7 @@ from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.remote.keys import API_KEY, api_key
 from lerobot_roborecover.remote.served import ServedPolicy
@@ -54,8 +55,11 @@ class ServeConfig:
             self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
             self.policy.pretrained_path = Path(path)
 
-    def check(self) -> None:
+    def check(self) -> PreTrainedConfig:
         """Refuses what cannot be used.
+
+        Returns:
+            `policy`.
 
         Raises:
             OptionError: naming the option, its value and what it may be.
@@ -78,6 +82,7 @@ class ServeConfig:
                 f"--host={self.host}: whoever reaches this address could use the policy. Set {API_KEY} here "
                 "and at the client; or listen on 127.0.0.1 and use an SSH tunnel; or say --insecure=true"
             )
+        return self.policy
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -125,17 +130,16 @@ def public_name(path: str) -> str:
     return Path(path).resolve().name if Path(path).exists() else path
 
 
-@parser.wrap()
 def serve(cfg: ServeConfig) -> int:
     """Serves until it is interrupted; see `main`."""
-    cfg.check()
+    policy = cfg.check()
     options = ServeOptions(
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
         api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
-    served = load_served(cfg.policy, cfg.rename_map, cfg.max_batch)
-    server = PolicyServer(served, public_name(str(cfg.policy.pretrained_path)), options)
-    if cfg.policy.type == "xvla":
+    served = load_served(policy, cfg.rename_map, cfg.max_batch)
+    server = PolicyServer(served, public_name(str(policy.pretrained_path)), options)
+    if policy.type == "xvla":
         logger.warning(
             "lerobot-eval gives X-VLA processors of its own on LIBERO, which a client does not know: its "
             "scores through a server are not those of --policy.path"
@@ -144,7 +148,7 @@ def serve(cfg: ServeConfig) -> int:
     def ready(port: int) -> None:
         host = f"[{cfg.host}]" if ":" in cfg.host else cfg.host
         scheme = "wss" if cfg.certfile else "ws"
-        print(f"serving {cfg.policy.type} at {scheme}://{host}:{port} (Ctrl-C ends)", flush=True)
+        print(f"serving {policy.type} at {scheme}://{host}:{port} (Ctrl-C ends)", flush=True)
 
     asyncio.run(server.run(ready))
     print(f"stopped after {server.served} inferences", flush=True)
@@ -161,4 +165,4 @@ def main(argv: Sequence[str]) -> int:
     logging.getLogger("websockets").setLevel(logging.WARNING)
     register_third_party_plugins()
     sys.argv[:] = ["roborecover-serve", *argv]
-    return serve()
+    return run_with_arguments(serve)

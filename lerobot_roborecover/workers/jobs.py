@@ -223,7 +223,7 @@ def _value(outcome: Outcome) -> Any:
 
 def _name_of(work: Callable[..., Any]) -> str:
     """`module:function`, as a worker finds it: the program that was started is no `__main__` there."""
-    module, name = work.__module__, work.__qualname__
+    module, name = work.__module__, getattr(work, "__qualname__", repr(work))
     if module == "__main__":
         spec = getattr(sys.modules["__main__"], "__spec__", None)
         module = spec.name if spec is not None else module

@@ -127,8 +127,10 @@ def encoded(frames: Sequence[np.ndarray], encoder: Encoder) -> list[np.ndarray]:
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     buffer.seek(0)
+    found: list[np.ndarray] = []
     with av.open(buffer, "r") as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        found.extend(frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
+    return found
 
 
 def ssim(original: np.ndarray, replay: np.ndarray) -> tuple[float, ...]:

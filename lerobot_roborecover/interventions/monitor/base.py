@@ -51,8 +51,9 @@ class Answers:
 class MonitorRewardModel(PreTrainedRewardModel):
     """A reward model whose reward is the label: 0 before the recovery point, 1 from it on."""
 
-    config_class = RewardModelConfig
-    name = "roborecover_monitor_base"
+    # LeRobot declares both as None, for subclasses to replace.
+    config_class: type[RewardModelConfig] = RewardModelConfig  # ty: ignore[incompatible-attribute-override]
+    name: str = "roborecover_monitor_base"  # ty: ignore[incompatible-attribute-override]
 
     def __init__(self, config: Any, dataset_stats: Any = None, dataset_meta: Any = None, **_: Any):
         super().__init__(config)
@@ -79,7 +80,7 @@ class MonitorRewardModel(PreTrainedRewardModel):
     @property
     def max_batch(self) -> int:
         """Frames it can judge at once."""
-        return self.config.max_batch
+        raise NotImplementedError
 
     @torch.inference_mode()
     def judge(self, observations: Mapping[str, Tensor], instructions: Sequence[str]) -> Verdicts:
@@ -208,7 +209,8 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
     Raises:
         MonitorError: the dataset lacks an input, or has it in another shape.
     """
-    known = {k: f for k, f in dataset_to_policy_features(dict(features)).items() if config.can_read(k, f)}
+    there = dataset_to_policy_features({k: dict(f) for k, f in features.items()})
+    known = {k: f for k, f in there.items() if config.can_read(k, f)}
     if not config.input_features:
         wanted = [k.strip() for k in config.inputs.split(",") if k.strip()] or list(known)
         missing = [k for k in wanted if k not in known]
@@ -219,9 +221,9 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
             )
         config.input_features = {k: known[k] for k in wanted}
     for key, feature in config.input_features.items():
-        there = known.get(key)
+        own = known.get(key)
         axes = slice(0, 1) if feature.type is FeatureType.VISUAL else slice(None)
-        if there is None or tuple(there.shape)[axes] != tuple(feature.shape)[axes]:
+        if own is None or tuple(own.shape)[axes] != tuple(feature.shape)[axes]:
             raise MonitorError(
                 f"the monitor reads {key} of shape {tuple(feature.shape)}; the dataset has "
                 f"{ {k: tuple(f.shape) for k, f in known.items()} }"

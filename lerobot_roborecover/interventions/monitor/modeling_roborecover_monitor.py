@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
+from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -36,6 +37,7 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
 
     config_class = RoboRecoverMonitorConfig
     name = "roborecover_monitor"
+    config: RoboRecoverMonitorConfig
 
     def __init__(
         self,
@@ -74,6 +76,11 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
             self.model = get_peft_model(base, lora, autocast_adapter_dtype=True)
         except ValueError as err:
             raise MonitorError(f"lora_targets={config.lora_targets}: {err}") from None
+
+    @property
+    def max_batch(self) -> int:
+        """Frames it can judge at once."""
+        return self.config.max_batch
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """The adapters alone."""
@@ -192,10 +199,10 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         cls,
         pretrained_name_or_path: str | Path,
         *,
-        config: RoboRecoverMonitorConfig | None = None,
+        config: RewardModelConfig | None = None,
         revision: str | None = None,
         **kwargs: Any,
-    ) -> RoboRecoverMonitorRewardModel:
+    ) -> Self:
         """Loads the base, then the adapters from a folder or the Hub, in evaluation mode.
 
         Raises:
@@ -205,6 +212,8 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
 
         if config is None:
             config = RoboRecoverMonitorConfig.from_pretrained(pretrained_name_or_path, revision=revision)
+        if not isinstance(config, RoboRecoverMonitorConfig):
+            raise MonitorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
         file = find_file(pretrained_name_or_path, ADAPTER_FILE, revision)
         model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
         try:
@@ -230,19 +239,20 @@ def load_base(config: RoboRecoverMonitorConfig) -> tuple[Any, Any]:
     """
     from transformers import AutoConfig, AutoProcessor, Qwen3VLForConditionalGeneration
 
+    revision = config.base_revision or "main"
     try:
-        kind = AutoConfig.from_pretrained(config.base_model, revision=config.base_revision).model_type
+        kind = AutoConfig.from_pretrained(config.base_model, revision=revision).model_type
         if kind != "qwen3_vl":
             raise MonitorError(
                 f"base_model={config.base_model}: is a {kind!r} model; this monitor is built on Qwen3-VL"
             )
         base = Qwen3VLForConditionalGeneration.from_pretrained(
             config.base_model,
-            revision=config.base_revision,
+            revision=revision,
             dtype=getattr(torch, config.dtype),
             attn_implementation=config.attention,
         )
-        processor = AutoProcessor.from_pretrained(config.base_model, revision=config.base_revision)
+        processor = AutoProcessor.from_pretrained(config.base_model, revision=revision)
     except (OSError, ValueError) as err:
         if isinstance(err, MonitorError):
             raise
@@ -278,7 +288,7 @@ def base_fingerprint(base: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def _to_bytes(pictures: Tensor, longest: int | None) -> Sequence[Tensor]:
+def _to_bytes(pictures: Tensor, longest: int | None) -> Tensor:
     """(B, 3, H, W) uint8, as the image processor expects, brought down in size where asked."""
     pictures = pictures.float()
     height, width = pictures.shape[-2:]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from lerobot.configs import FeatureType
+from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -32,6 +33,11 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
 
     config_class = RoboRecoverMonitorSmallConfig
     name = "roborecover_monitor_small"
+    config: RoboRecoverMonitorSmallConfig
+    mean: Tensor
+    """(W,) of the vectors, one after another."""
+    std: Tensor
+    """(W,) of the same."""
 
     def __init__(
         self,
@@ -62,6 +68,11 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
             layers.append(nn.Dropout(config.dropout))
             joined = config.hidden_dim
         self.head = nn.Sequential(*layers, nn.Linear(joined, 1))
+
+    @property
+    def max_batch(self) -> int:
+        """Frames it can judge at once."""
+        return self.config.max_batch
 
     def _normalise_as(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
         def joined(name: str) -> Tensor:
@@ -124,10 +135,10 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
         cls,
         pretrained_name_or_path: str | Path,
         *,
-        config: RoboRecoverMonitorSmallConfig | None = None,
+        config: RewardModelConfig | None = None,
         revision: str | None = None,
         **kwargs: Any,
-    ) -> RoboRecoverMonitorSmallRewardModel:
+    ) -> Self:
         """Loads a checkpoint from a folder or the Hub, in evaluation mode.
 
         Raises:
@@ -135,6 +146,8 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
         """
         if config is None:
             config = RoboRecoverMonitorSmallConfig.from_pretrained(pretrained_name_or_path, revision=revision)
+        if not isinstance(config, RoboRecoverMonitorSmallConfig):
+            raise MonitorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
         file = find_file(pretrained_name_or_path, WEIGHTS_FILE, revision)
         model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
         try:

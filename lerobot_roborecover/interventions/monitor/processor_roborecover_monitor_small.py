@@ -19,4 +19,4 @@ def make_roborecover_monitor_small_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """Processors for `lerobot-train`; `dataset_stats` are the model's business."""
-    return plain_processors(config.device)
+    return plain_processors(str(config.device))

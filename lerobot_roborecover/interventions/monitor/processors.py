@@ -26,13 +26,14 @@ def plain_processors(
     A monitor reads raw observations: what it does with them is in the model, because LeRobot 0.6.1 does not
     reload a reward model's processors.
     """
-    before = [RenameObservationsProcessorStep(rename_map={}), DeviceProcessorStep(device=device)]
-    return (
-        PolicyProcessorPipeline(steps=before, name=POLICY_PREPROCESSOR_DEFAULT_NAME),
-        PolicyProcessorPipeline(
-            steps=[DeviceProcessorStep(device="cpu")],
-            name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
-            to_transition=policy_action_to_transition,
-            to_output=transition_to_policy_action,
-        ),
+    before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
+        steps=[RenameObservationsProcessorStep(rename_map={}), DeviceProcessorStep(device=device)],
+        name=POLICY_PREPROCESSOR_DEFAULT_NAME,
     )
+    after = PolicyProcessorPipeline[PolicyAction, PolicyAction](
+        steps=[DeviceProcessorStep(device="cpu")],
+        name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return before, after

@@ -50,8 +50,8 @@ def annotate(config: AnnotateConfig, say: Callable[[str], None]) -> None:
                 name, address = waiting.pop(0)
                 annotator = LineProcess(f"the automatic annotator {name}", _work, name, address)
                 working.add(browsers.enter_context(annotator))
-            for annotator in wait(list(working)):
-                assert isinstance(annotator, LineProcess)
+            ready = wait([annotator.fileno() for annotator in working])
+            for annotator in [a for a in working if a.fileno() in ready]:
                 line = annotator.hear()
                 if line is None:
                     working.remove(annotator)

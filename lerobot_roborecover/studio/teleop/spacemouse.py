@@ -10,6 +10,7 @@ library with it. Reports (little-endian, 350 is about the end of the range):
 
 from __future__ import annotations
 
+import importlib
 import logging
 import struct
 import threading
@@ -139,7 +140,7 @@ def find_spacemouse() -> Device:
         ScenarioError: there is none, or it may not be read.
     """
     try:
-        import hid
+        hid = importlib.import_module("hid")
     except ImportError as err:
         raise ScenarioError(
             f"a SpaceMouse needs {err.name}: pip install 'lerobot_env_roborecover[teleop]'"
@@ -149,7 +150,7 @@ def find_spacemouse() -> Device:
     mice = mice or [d for d in found if d["vendor_id"] == VENDORS[0]]
     if not mice:
         raise ScenarioError("no SpaceMouse is plugged into this machine; leave --spacemouse out")
-    device: Any = hid.device()
+    device = hid.device()
     try:
         device.open_path(mice[0]["path"])
     except OSError as err:
