@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.env.directives import WIDTH
 from lerobot_roborecover.interventions.director import Director, Episode
-from lerobot_roborecover.policies.host import Chunk, PolicyError
+from lerobot_roborecover.policies.host import Chunk, PolicyError, Processor
 
 _NOISE = ("per_trial", "per_batch", "unseeded")
 """From the best to the worst."""
@@ -32,9 +32,9 @@ class InterventionHost:
     def __init__(
         self,
         director: Director,
-        env_preprocessor: Callable[[dict], dict],
-        env_postprocessor: Callable[[dict], dict],
-        preprocessor: Callable[[dict], dict],
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: Processor,
         max_batch: int,
     ):
         self._director = director
@@ -71,19 +71,23 @@ class InterventionHost:
         histories: Sequence[Episode],
     ) -> list[Chunk | PolicyError]:
         """One chunk with directives per waiting slot."""
-        prepared: list[Any] = []
+        prepared: list[dict[str, torch.Tensor] | PolicyError] = []
         for observation, instruction in zip(observations, instructions, strict=True):
             try:
                 prepared.append(self._prepare(observation, instruction))
             except Exception as err:  # an observation that cannot be read costs its trial alone
                 prepared.append(PolicyError(f"{type(err).__name__}: {err}"))
-        good = [i for i, p in enumerate(prepared) if not isinstance(p, PolicyError)]
+        good = {i: p for i, p in enumerate(prepared) if not isinstance(p, PolicyError)}
         chunks = self._director.act(
-            [prepared[i] for i in good], [instructions[i] for i in good], [histories[i] for i in good]
+            list(good.values()), [instructions[i] for i in good], [histories[i] for i in good]
         )
-        for i, chunk in zip(good, chunks, strict=True):
-            prepared[i] = chunk if isinstance(chunk, PolicyError) else self._after(chunk)
-        return prepared
+        answers = dict(zip(good, chunks, strict=True))
+        return [
+            p if isinstance(p, PolicyError) else self._finished(answers[i]) for i, p in enumerate(prepared)
+        ]
+
+    def _finished(self, chunk: Chunk | PolicyError) -> Chunk | PolicyError:
+        return chunk if isinstance(chunk, PolicyError) else self._after(chunk)
 
     def _prepare(self, observation: Mapping[str, Any], instruction: str) -> dict[str, torch.Tensor]:
         batch = {**preprocess_observation(_with_batch_axis(observation)), "task": [instruction]}

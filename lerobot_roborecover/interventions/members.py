@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.env.intervention_options import POLICY_TYPE
@@ -30,7 +31,13 @@ class MemberHost(PolicyHost):
         max_batch: slots asked for at once, at most.
     """
 
-    def __init__(self, policy: Any, preprocessor: Any, postprocessor: Any, max_batch: int = 64):
+    def __init__(
+        self,
+        policy: PreTrainedPolicy,
+        preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+        postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction],
+        max_batch: int = 64,
+    ):
         super().__init__(policy, _same, _same, preprocessor, postprocessor, max_batch)
 
     @property
@@ -42,7 +49,7 @@ class MemberHost(PolicyHost):
         return self._pre({**join(observations), "task": list(instructions)})
 
 
-def _same(value: Any) -> Any:
+def _same[T](value: T) -> T:
     return value
 
 

@@ -22,9 +22,9 @@ from lerobot_roborecover.interventions.configuration_intervention import (
 from lerobot_roborecover.interventions.director import Director, Episode
 from lerobot_roborecover.interventions.driver import load_driver
 from lerobot_roborecover.interventions.host import InterventionHost, tensors
-from lerobot_roborecover.interventions.members import load_member
+from lerobot_roborecover.interventions.members import MemberHost, load_member
 from lerobot_roborecover.interventions.monitor_interface import Monitor
-from lerobot_roborecover.policies.host import PolicyError
+from lerobot_roborecover.policies.host import PolicyError, Processor
 
 
 class RoboRecoverInterventionPolicy(PreTrainedPolicy):
@@ -43,7 +43,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         config.check()
         features, action = config.input_features or {}, (config.output_features or {}).get(ACTION)
 
-        def member(role: str) -> Any:
+        def member(role: str) -> MemberHost:
             return load_member(role, getattr(config, role), str(config.device), features, action)
 
         members = {Controller.BASE: member("base")}
@@ -67,12 +67,16 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         self._rows: list[list[np.ndarray]] = []
 
     @property
-    def policies(self) -> list[Any]:
+    def policies(self) -> list[PreTrainedPolicy]:
         """The policies that act: base and correction."""
         return [member.parts[0] for member in self.director.members.values()]
 
     def make_host(
-        self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int
+        self,
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: Processor,
+        max_batch: int,
     ) -> InterventionHost:
         """What `roborecover eval` asks in place of `select_action`."""
         return InterventionHost(self.director, env_preprocessor, env_postprocessor, preprocessor, max_batch)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,15 +23,20 @@ class ReplicaLostError(RuntimeError):
 
 type Chunk = np.ndarray
 """(n, A) actions to be executed without looking in between."""
+type Processor = Callable[[dict[str, Any]], dict[str, Any]]
+"""An env type's, of observations or of actions: a batch by LeRobot's keys to another."""
 
 
-class Host(Protocol):
-    """A policy with its processors, which keeps a history per trial."""
+class ReplicaHost(Protocol):
+    """What keeps a history per trial."""
 
-    max_batch: int
-    """Slots asked for at once, at most."""
-    batched: bool
-    """Whether slots share inferences."""
+    @property
+    def max_batch(self) -> int:
+        """Slots asked for at once, at most."""
+
+    @property
+    def batched(self) -> bool:
+        """Whether slots share inferences."""
 
     def noise(self, seed: int | None) -> str:
         """How noise is drawn in a run of that seed; the value of `TrialRow.noise`."""
@@ -41,6 +46,10 @@ class Host(Protocol):
 
     def finish(self, history: Any) -> None:
         """Gives back what a trial held."""
+
+
+class Host(ReplicaHost, Protocol):
+    """A policy with its processors, which keeps a history per trial."""
 
     def act(
         self,
@@ -57,7 +66,11 @@ class MakesHost(Protocol):
     """A policy that is asked through a host of its own: it keeps histories itself."""
 
     def make_host(
-        self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int
+        self,
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: Processor,
+        max_batch: int,
     ) -> Host:
         """Its host.
 
@@ -73,8 +86,8 @@ class Replica(Protocol):
     """A host that is asked first and answers later, so that an engine can wait for several at once."""
 
     @property
-    def host(self) -> Any:
-        """`max_batch`, `batched`, `noise`, `start` and `finish` of `Host`."""
+    def host(self) -> ReplicaHost:
+        """What is asked of it at once."""
 
     @property
     def opening(self) -> bool:

@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.envs import preprocess_observation
+from lerobot.policies import PreTrainedPolicy
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
-from lerobot_roborecover.policies.host import Chunk, PolicyError
+from lerobot_roborecover.policies.host import Chunk, PolicyError, Processor
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +51,7 @@ class History:
     stream: list[torch.Tensor] | None
     """States of torch's generators, the CPU's and the GPU's, for the trial's next draw; None where the run
     has no seed."""
-    policy: Any = None
+    policy: PreTrainedPolicy | None = None
     """This trial's instance, for a policy that keeps history in itself."""
 
 
@@ -69,16 +71,18 @@ class PolicyHost:
 
     def __init__(
         self,
-        policy: Any,
-        env_preprocessor: Any,
-        env_postprocessor: Any,
-        preprocessor: Any,
-        postprocessor: Any,
+        policy: PreTrainedPolicy,
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+        postprocessor: PolicyProcessorPipeline[PolicyAction, PolicyAction],
         max_batch: int = 64,
         *,
         in_training: bool = False,
     ):
-        self._policy, self._config = policy, policy.config
+        self._policy = policy
+        self._config: Any = policy.config
+        """Each policy type declares its own options."""
         self._no_grad = torch.no_grad if in_training else torch.inference_mode
         self._env_pre, self._env_post = env_preprocessor, env_postprocessor
         self._pre, self._post = preprocessor, postprocessor
@@ -92,7 +96,7 @@ class PolicyHost:
             self._noise = "inside"
         self._device = next(policy.parameters()).device
         self._amp = bool(getattr(self._config, "use_amp", False))
-        self._idle: list[Any] = []
+        self._idle: list[PreTrainedPolicy] = []
 
     def noise(self, seed: int | None) -> str:
         """How noise is drawn; the value of `TrialRow.noise`.
@@ -123,8 +127,9 @@ class PolicyHost:
                 torch.manual_seed(seed)
                 history.stream = self._stream_state()
         if not self.batched:
-            history.policy = self._idle.pop() if self._idle else sharing_weights(self._policy)
-            history.policy.reset()
+            policy = self._idle.pop() if self._idle else sharing_weights(self._policy)
+            policy.reset()
+            history.policy = policy
         if step and self._noise == "argument" and history.stream is not None:
             for _ in range(step):
                 self._draw(history)
@@ -171,7 +176,10 @@ class PolicyHost:
         return self._act_together(observations, instructions, noise)
 
     def _act_together(
-        self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str], noise: Any
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        instructions: Sequence[str],
+        noise: torch.Tensor | None,
     ) -> list[Chunk | PolicyError]:
         """Halves a batch that raises until it is known whose observation did it, or until it fits."""
         try:
@@ -199,7 +207,7 @@ class PolicyHost:
         ]
 
     def _predict(
-        self, observations: Sequence, instructions: Sequence[str], noise: Any
+        self, observations: Sequence, instructions: Sequence[str], noise: torch.Tensor | None
     ) -> list[Chunk | PolicyError]:
         batch = self._prepare(observations, instructions)
         with self._no_grad(), torch.autocast(self._device.type, enabled=self._amp):
@@ -212,26 +220,38 @@ class PolicyHost:
     def _act_alone(
         self, observation: Mapping[str, Any], instruction: str, history: History
     ) -> Chunk | PolicyError:
+        policy = history.policy
+        assert policy is not None, "a policy that is asked alone has an instance for each trial"
         try:
             batch = self._prepare([observation], [instruction])
             autocast = torch.autocast(self._device.type, enabled=self._amp)
             with self._stream(history), self._no_grad(), autocast:
-                return self._actions(history.policy.select_action(batch))
+                return self._actions(policy.select_action(batch))
         except Exception as err:  # a policy may raise anything, and it costs its trial alone
             logger.warning("the policy raised", exc_info=True)
             return PolicyError(f"{type(err).__name__}: {err}")
 
     @property
-    def parts(self) -> tuple[Any, Any, Any]:
+    def parts(
+        self,
+    ) -> tuple[
+        PreTrainedPolicy,
+        PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+        PolicyProcessorPipeline[PolicyAction, PolicyAction],
+    ]:
         """The policy, its preprocessor and its postprocessor."""
         return self._policy, self._pre, self._post
 
-    def env_batch(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
+    def env_batch(
+        self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]
+    ) -> dict[str, Any]:
         """Observations as the policy's own preprocessor gets them: LeRobot's keys, env processor applied."""
         batch = preprocess_observation(_stack(list(observations)))
         return self._env_pre({**batch, "task": list(instructions)})
 
-    def _prepare(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
+    def _prepare(
+        self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]
+    ) -> dict[str, Any]:
         return self._pre(self.env_batch(observations, instructions))
 
     def _actions(self, action: torch.Tensor) -> np.ndarray:
@@ -267,14 +287,15 @@ class PolicyHost:
             return torch.normal(0.0, 1.0, shape, dtype=torch.float32, device=self._device)
 
 
-def sharing_weights(policy: Any) -> Any:
+def sharing_weights[P: torch.nn.Module](policy: P) -> P:
     """A copy with history of its own and the same parameters and buffers, registered ones and others.
 
     LingBot-VA keeps its frozen VAE and text encoder (20 GB) in a plain dict and loads them at its first
     inference: they are loaded before the first copy is made, once.
     """
-    if hasattr(policy, "_ensure_frozen_modules"):
-        policy._ensure_frozen_modules()
+    load = getattr(policy, "_ensure_frozen_modules", None)
+    if callable(load):
+        load()
     shared: dict[int, torch.Tensor] = {}
     _collect_weights(policy, shared, set())
     return copy.deepcopy(policy, dict(shared))

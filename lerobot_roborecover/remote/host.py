@@ -10,7 +10,7 @@ import torch
 from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
-from lerobot_roborecover.policies.host import Chunk, PolicyAwayError, PolicyError
+from lerobot_roborecover.policies.host import Chunk, PolicyAwayError, PolicyError, Processor
 from lerobot_roborecover.remote.errors import RemoteError, ServerAwayError, SessionGoneError
 from lerobot_roborecover.remote.modeling_remote import RemotePolicy, Slot, split
 
@@ -31,9 +31,9 @@ class RemoteHost:
     def __init__(
         self,
         policy: RemotePolicy,
-        env_preprocessor: Any,
-        env_postprocessor: Any,
-        preprocessor: Any,
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: Processor,
         max_batch: int = 64,
     ):
         self._policy = policy

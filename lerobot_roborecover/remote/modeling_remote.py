@@ -23,6 +23,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from lerobot_roborecover.policies.host import Processor
 from lerobot_roborecover.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.remote.connection import Request, Server, ServerOptions
 from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError, SessionGoneError
@@ -169,7 +170,11 @@ class RemotePolicy(PreTrainedPolicy):
         return {}
 
     def make_host(
-        self, env_preprocessor: Any, env_postprocessor: Any, preprocessor: Any, max_batch: int = 64
+        self,
+        env_preprocessor: Processor,
+        env_postprocessor: Processor,
+        preprocessor: Processor,
+        max_batch: int = 64,
     ) -> RemoteHost:
         """The policy as `roborecover eval` asks it.
 

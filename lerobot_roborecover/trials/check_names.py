@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.configs import FeatureType, NormalizationMode
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.trials.check_numbers import Stats, statistics_problem
@@ -123,7 +124,7 @@ def check_features(
     return ok("inputs", f"{len(wanted)} features present")
 
 
-def check_action_width(saved: Any, width: int) -> Finding:
+def check_action_width(saved: PreTrainedConfig, width: int) -> Finding:
     """The checkpoint's own action width against the env's; LeRobot cuts or pads without a word.
 
     Args:
@@ -186,7 +187,7 @@ def check_statistics(pre: Any, post: Any, wanted: Mapping[str, Any], width: int)
     return ok("normalisation", ", ".join(modes) or "none: values go to the policy as they are")
 
 
-def check_weights(policy: Any, path: str) -> Finding:
+def check_weights(policy: torch.nn.Module, path: str) -> Finding:
     """Whether the model holds the checkpoint's numbers: LeRobot's π0 and π0.5 go on with random weights when
     theirs cannot be read (`modeling_pi05.from_pretrained`, "Returning model without loading").
 
@@ -240,7 +241,7 @@ def _weights_file(path: str) -> Path | None:
     return Path(cached) if isinstance(cached, str) else None
 
 
-def check_horizon(config: Any, platform: str, shortest: int) -> Finding:
+def check_horizon(config: PreTrainedConfig, platform: str, shortest: int) -> Finding:
     """How much of a chunk is executed without looking.
 
     Args:

@@ -29,7 +29,8 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial import action_problem
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.policies.host import PolicyError
+from lerobot_roborecover.policies.host import Host, PolicyError
+from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials import check_names as names
 from lerobot_roborecover.trials import check_numbers as numbers
@@ -119,26 +120,26 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
         except Exception as err:  # a checkpoint may fail to load in any way
             return [_not_loaded(err), *findings]
         findings.insert(0, ok("loads", f"{config.type} on {config.device}"))
-        parts = getattr(host, "parts", None)
-        policy = parts[0] if parts else None
-        if policy is not None and path and not config.use_peft:
-            findings.append(names.check_weights(policy, str(path)))
-        if parts:
-            findings.append(names.check_statistics(parts[1], parts[2], wanted, width))
+        own = host if isinstance(host, PolicyHost) else None  # a composite or remote policy has no such parts
+        if own is not None:
+            policy, pre, post = own.parts
+            if path and not config.use_peft:
+                findings.append(names.check_weights(policy, str(path)))
+            findings.append(names.check_statistics(pre, post, wanted, width))
         horizons = [s.task.horizon for s in scenarios]
         findings.append(names.check_horizon(config, run.pool.config.platform, min(horizons)))
         scenario = min(scenarios, key=lambda s: len(s.prefix))
         start = _hand_off(run, scenario)
         if isinstance(start, Finding):
             return [*findings, start]
-        if parts:
-            findings += _look(cfg, host, run, scenarios, scenario, start)
+        if own is not None:
+            findings += _look(cfg, own, run, scenarios, scenario, start)
         steps = _take_steps(cfg, host, run, scenario, start)
         if isinstance(steps, Finding):
             return [*findings, steps]
         findings.append(numbers.check_executed(steps.actions, run.pool.config.platform))
-        if parts:
-            findings.append(_check_states(host, scenario, steps, parts[1], run.pool.config.platform))
+        if own is not None:
+            findings.append(_check_states(own, scenario, steps, run.pool.config.platform))
         findings.append(_check_trials(cfg, host, scenario, steps.observations[0]))
         findings += _estimate(cfg, host, scenarios, scenario, steps)
         return findings
@@ -196,7 +197,7 @@ def _hand_off(run: Run, scenario: Scenario) -> EpisodeStart | Finding:
 
 
 def _take_steps(
-    cfg: CheckPolicyConfig, host: Any, run: Run, scenario: Scenario, start: EpisodeStart
+    cfg: CheckPolicyConfig, host: Host, run: Run, scenario: Scenario, start: EpisodeStart
 ) -> Steps | Finding:
     """A few steps, one action at a time, so that every observation is seen."""
     slot = run.pool.slots(1)[0]
@@ -248,7 +249,7 @@ def _take_steps(
 
 def _look(
     cfg: CheckPolicyConfig,
-    host: Any,
+    host: PolicyHost,
     run: Run,
     scenarios: ScenarioSet,
     scenario: Scenario,
@@ -298,16 +299,16 @@ def _look(
     return found
 
 
-def _check_states(host: Any, scenario: Scenario, steps: Steps, pre: Any, platform: str) -> Finding:
+def _check_states(host: PolicyHost, scenario: Scenario, steps: Steps, platform: str) -> Finding:
     batch = host.env_batch(steps.observations, [scenario.task.instruction] * len(steps.observations))
     key = "observation.state"
     if key not in batch:
         return ok("states fit the training data", "not checked: the policy gets no robot state")
-    stats, _ = names.statistics_of(pre)
+    stats, _ = names.statistics_of(host.parts[1])
     return numbers.check_states(batch[key].float().cpu().numpy(), stats.get(key), platform)
 
 
-def _check_trials(cfg: CheckPolicyConfig, host: Any, scenario: Scenario, observation: dict) -> Finding:
+def _check_trials(cfg: CheckPolicyConfig, host: Host, scenario: Scenario, observation: dict) -> Finding:
     """Whether several trials of a scenario are several trials."""
     answers = []
     for trial in range(2):
@@ -315,9 +316,10 @@ def _check_trials(cfg: CheckPolicyConfig, host: Any, scenario: Scenario, observa
         (chunk,) = host.act([observation], [scenario.task.instruction], [history])
         host.finish(history)
         answers.append(chunk)
-    if cfg.eval.n_episodes == 1 or isinstance(answers[0], PolicyError):
+    first, second = answers
+    if cfg.eval.n_episodes == 1 or isinstance(first, PolicyError):
         return ok("trials", str(cfg.eval.n_episodes))
-    if np.array_equal(*answers):
+    if not isinstance(second, PolicyError) and np.array_equal(first, second):
         fixed = getattr(cfg.policy, "inference_seed", None)
         remedy = (
             "--policy.inference_seed=null draws anew in every trial"
@@ -332,7 +334,7 @@ def _check_trials(cfg: CheckPolicyConfig, host: Any, scenario: Scenario, observa
 
 
 def _estimate(
-    cfg: CheckPolicyConfig, host: Any, scenarios: ScenarioSet, scenario: Scenario, steps: Steps
+    cfg: CheckPolicyConfig, host: Host, scenarios: ScenarioSet, scenario: Scenario, steps: Steps
 ) -> list[Finding]:
     """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
     slots = min(cfg.runner.slots or os.cpu_count() or 1, len(scenarios) * cfg.eval.n_episodes)

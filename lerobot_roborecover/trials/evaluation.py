@@ -20,6 +20,7 @@ import draccus
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
 
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.env.configs import RecoveryEnvConfig, env_type
@@ -90,7 +91,7 @@ def evaluate(
         raise OptionError(f"trials={trials}: must be 1 or more")
     chosen = _scenario_set(scenarios, env)
     options = _env_config(env, chosen.platform)
-    module = policy if isinstance(policy, torch.nn.Module) else None
+    module: PreTrainedPolicy | None = policy if isinstance(policy, torch.nn.Module) else None
     with tempfile.TemporaryDirectory(prefix="roborecover-") as folder, untouched(module):
         options.trial_log = str(log or Path(folder) / "trials.jsonl")
         config = _policy_config(policy, device)
@@ -192,7 +193,7 @@ def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
     return config
 
 
-def _host(spec: HostSpec, module: torch.nn.Module | None, processors: tuple[Any, Any] | None) -> Host:
+def _host(spec: HostSpec, module: PreTrainedPolicy | None, processors: tuple[Any, Any] | None) -> Host:
     if module is None:
         return load_host(spec)
     if processors is None and not spec.policy.pretrained_path:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 
@@ -26,7 +25,7 @@ def load_remedy(err: Exception) -> str:
     return ""
 
 
-def other_action_width(config: Any, width: int) -> int | None:
+def other_action_width(config: PreTrainedConfig, width: int) -> int | None:
     """The action width of a checkpoint for another robot; None where it fits, or does not say.
 
     Args:

@@ -198,9 +198,9 @@ class RayReplica(_Remote):
         self._actor.start.remote(self._tokens, seed)
         return self._tokens
 
-    def finish(self, token: int) -> None:
+    def finish(self, history: int) -> None:
         """Gives back what a trial held."""
-        self._actor.finish.remote(token)
+        self._actor.finish.remote(history)
 
     def ask(self, observations: list, instructions: list[str], histories: list) -> None:
         """Begins an inference."""
