@@ -77,7 +77,8 @@ class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
         )
         return PlatformPart(slot, setup.decisive, setup.picture, setup.assets)
 
-    def create_envs(  # ty: ignore[incompatible-method-override] LeRobot names tasks by number, but asks nowhere
+    # LeRobot's annotation has numbers for task ids; its loops only sort and print them.
+    def create_envs(  # ty: ignore[incompatible-method-override]
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[str, ScenarioVectorEnv]]:
         """`{group: {scenario id: vector env}}`; raises what `run_spec` and `env.run.open_run` raise."""

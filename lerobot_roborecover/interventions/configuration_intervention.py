@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.optim.optimizers import OptimizerConfig
 
 from lerobot_roborecover.env.intervention_options import MODES, POLICY_TYPE
 from lerobot_roborecover.env.options import OptionError
@@ -109,7 +109,7 @@ class RoboRecoverInterventionConfig(PreTrainedConfig):
         """It is not trained."""
         return None
 
-    def get_optimizer_preset(self) -> Any:
+    def get_optimizer_preset(self) -> OptimizerConfig:
         """Refuses: its members are trained on their own."""
         raise OptionError(
             "roborecover_intervention is put together, not trained: train its correction policy with "

@@ -43,7 +43,7 @@ class Episode:
     controller: Controller = Controller.BASE
     history: Any = None
     """The acting policy's, or what the driver calls the slot."""
-    stream: Any = None
+    stream: list[torch.Tensor] | None = None
     """The trial's random stream, while no policy has it."""
     queue: np.ndarray | None = None
     """(n, A) actions still to be executed."""

@@ -66,7 +66,7 @@ class SimulatorActor:
         reply = self.run(*(("smoke", self._smoke) if self._smoke is not None else ("fingerprint", None)))
         return where, reply if isinstance(reply, SlotFailure) else None
 
-    def run(self, command: str, argument: Any) -> Reply:
+    def run(self, command: str, argument: object) -> Reply:
         """One command of the slot and its reply."""
         self._slot.send(command, argument)
         return self._slot.receive()
@@ -155,7 +155,7 @@ class RaySlot(_Remote):
         where, failure = answer
         check_smoke(failure, where)
 
-    def send(self, command: str, argument: Any = None) -> None:
+    def send(self, command: str, argument: object = None) -> None:
         """Starts a command."""
         self.ready = self._actor.run.remote(command, argument)
 

@@ -31,7 +31,7 @@ class EngineSlot(Protocol):
     def opened(self) -> None:
         """Finds out whether the opening has worked."""
 
-    def send(self, command: str, argument: Any = None) -> None:
+    def send(self, command: str, argument: object = None) -> None:
         """Starts a command."""
 
     def receive(self) -> Reply:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.workers.messages import SlotFailure
 
 
-def check_smoke(reply: Any, where: str = "") -> None:
+def check_smoke(reply: object, where: str = "") -> None:
     """Looks at a slot's reply to its first command.
 
     Args:

@@ -93,6 +93,6 @@ def in_order[Item](
                 given += 1
 
 
-def failed(reply: Any) -> str:
+def failed(reply: object) -> str:
     """What went wrong with a command, or nothing."""
     return reply.message if isinstance(reply, SlotFailure) else ""

@@ -60,7 +60,7 @@ class Command:
     """One thing to do; the slot replies once, with a `SlotFailure` where it cannot."""
 
     name: str
-    argument: Any = None
+    argument: object = None
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
-from lerobot_roborecover.workers.messages import Command, Reply, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotConfig, SlotFailure
 
 _LOG_TAIL_BYTES = 600
 _START_S = 60.0
@@ -31,7 +31,7 @@ command."""
 class Slot(Protocol):
     """A place where one trial at a time runs."""
 
-    def send(self, command: str, argument: Any = None) -> None:
+    def send(self, command: str, argument: object = None) -> None:
         """Starts a command."""
 
     def receive(self) -> Reply:
@@ -47,10 +47,10 @@ class InlineSlot:
 
     def __init__(self, config: SlotConfig):
         self._config = config
-        self._server: Any = None
-        self._pending: tuple[str, Any] | None = None
+        self._server: Server | None = None
+        self._pending: tuple[str, object] | None = None
 
-    def send(self, command: str, argument: Any = None) -> None:
+    def send(self, command: str, argument: object = None) -> None:
         """Remembers the command; it runs in `receive`."""
         self._pending = (command, argument)
 
@@ -142,7 +142,7 @@ class WorkerSlot:
         self._connection.send(self._config)
         self._started = False
 
-    def send(self, command: str, argument: Any = None) -> None:
+    def send(self, command: str, argument: object = None) -> None:
         """Sends a command to the worker; starts one where it was ended."""
         if self._connection is None:
             self._start()
