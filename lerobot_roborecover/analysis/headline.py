@@ -8,6 +8,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
 from lerobot_roborecover.words import counted
@@ -22,8 +23,9 @@ def headline(results: Results) -> str:
         + _intervals(results, best, rate)
         + "."
     ]
-    if lost := int(results.ranked.by_infrastructure[best].sum()):
-        reached = float(np.nanmean(results.ranked.reached_rates[best]))
+    reached = masked_mean(results.ranked.reached_rates[best][:, None])[0]
+    lost = int(results.ranked.by_infrastructure[best].sum())
+    if lost and not math.isnan(reached):
         as_what = "counts as a failure" if lost == 1 else "count as failures"
         sentences.append(
             f"{counted(lost, 'trial')} of it ended with a simulator or a machine and {as_what}; without, "

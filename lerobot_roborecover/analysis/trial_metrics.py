@@ -1,7 +1,7 @@
 """Numbers of single trials, averaged per policy: the place where a metric of one's own is added.
 
-A metric is a function of a trial row. It becomes a column of the table "Measured in the trials": the mean of the
-scenarios' means, each scenario counting the same, with an interval over what is independent.
+A metric is a function of a trial row. It becomes a column of the table "Measured in the trials": the mean of
+the scenarios' means, each scenario counting the same, with an interval over what is independent.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Metric:
     of: Callable[[TrialRow], float]
     """The trial's value; `NONE` leaves the trial out."""
     share: bool
-    """Values are from 0 to 1: shown in per cent, with the interval that rates have. Others have the percentile
-    bootstrap's."""
+    """Values are from 0 to 1: shown in per cent, with the interval that rates have. Others have the
+    percentile bootstrap's."""
     about: str
     """A sentence for those who read the table."""
 
@@ -50,7 +50,7 @@ METRICS = (
         "Steps to recover",
         _steps_to_recover,
         False,
-        "Steps to recover: new steps of the trials that succeed.",
+        "Steps to recover: new steps of successful trials.",
     ),
 )
 """Columns, in this order."""
