@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_roborecover.datasets.licenses import license_argument
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.agree import AgreeRequest
 
 HELP = "Agreement between annotators, and the scenarios that their votes resolve to."
 
@@ -31,35 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures, resolves, and writes what was asked for."""
-    from lerobot_roborecover.curation.agreement import format_agreement
-    from lerobot_roborecover.curation.annotation.votes import votes_folder
-    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
-    from lerobot_roborecover.curation.candidates import read_candidates
-    from lerobot_roborecover.curation.resolution import (
-        NOT_PEOPLES,
-        ResolutionConfig,
-        resolve,
-        write_discussion,
-        write_resolution,
-    )
-    from lerobot_roborecover.words import counted, next_line
+    from lerobot_roborecover.curation.agree import agree
 
-    candidates = read_candidates(args.dataset)
-    config = ResolutionConfig(args.votes_needed, args.tolerance, args.no_consensus)
-    found = resolve(candidates, votes_folder(args.dataset, args.votes), config)
-    print(
-        f"{counted(len(found.annotators), 'annotator')}: {', '.join(found.annotators)}; round {found.rounds}"
-    )
-    if NOT_PEOPLES[found.kind]:
-        print(NOT_PEOPLES[found.kind])
-    print(format_agreement(found.agreement))
-    print(", ".join(f"{n} {outcome}" for outcome, n in sorted(found.counts().items())))
-    if args.discuss:
-        listed = write_discussion(args.discuss, found)
-        print(f"{counted(listed, 'candidate')} to discuss" + (f" in {args.discuss}" if listed else ""))
-    if args.out:
-        write_resolution(args.out, candidates, found, config, license=args.license)
-        print(f"{counted(found.counts()['kept'], 'scenario')} in {args.out}")
-        print(attrition_table(count_stages(read_decisions(args.out))))
-        print(next_line(["screen", str(args.out), "--policy", "CHECKPOINT", "--out", "SCREENED"]))
+    agree(request(args), print)
     return 0
+
+
+def request(args: argparse.Namespace) -> AgreeRequest:
+    """Which votes to resolve, from parsed arguments."""
+    from lerobot_roborecover.curation.agree import AgreeRequest
+    from lerobot_roborecover.curation.resolution import ResolutionConfig
+
+    config = ResolutionConfig(args.votes_needed, args.tolerance, args.no_consensus)
+    return AgreeRequest(args.dataset, args.votes, config, args.discuss, args.out, args.license)

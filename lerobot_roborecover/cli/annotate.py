@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serves the page until interrupted, or has programs annotate."""
-    from lerobot_roborecover.curation.annotation.annotators import EYES, PREFIX, is_automatic
+    from lerobot_roborecover.curation.annotation.annotators import PREFIX, is_automatic
     from lerobot_roborecover.scenario import ScenarioError
     from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
-    from lerobot_roborecover.studio.automatic.run import annotate
+    from lerobot_roborecover.studio.automatic.run import annotate, session
 
     reserved = [name for name in args.annotators if is_automatic(name)]
     if reserved:
@@ -51,19 +51,25 @@ def run(args: argparse.Namespace) -> int:
         )
     if bool(args.annotators) == args.automatic:
         raise ScenarioError("name who annotates with --annotator NAME, or say --automatic")
-    config = AnnotateConfig(
-        dataset=args.dataset,
-        annotators=tuple(EYES) if args.automatic else args.annotators,
-        port=0 if args.automatic else args.port,
-        votes=args.votes,
-        seed=args.seed,
-        only=args.only,
-        examples=not (args.no_examples or args.automatic),
-    )
-    work = annotate if args.automatic else serve
     try:
-        work(config, lambda line: print(line, flush=True))
+        if args.automatic:
+            annotate(session(args.dataset, args.votes, args.seed, args.only), _say)
+        else:
+            config = AnnotateConfig(
+                dataset=args.dataset,
+                annotators=args.annotators,
+                port=args.port,
+                votes=args.votes,
+                seed=args.seed,
+                only=args.only,
+                examples=not args.no_examples,
+            )
+            serve(config, _say)
     except KeyboardInterrupt:
         # The way to end it; every vote is on disk already.
         print("stopped")
     return 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

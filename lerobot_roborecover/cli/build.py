@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 HELP = (
@@ -24,36 +25,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--dry-run", action="store_true", help="say what would run, and run nothing")
 
 
-def parse(argv: list[str]) -> argparse.Namespace:
-    """Takes a stage's command apart and checks its options, as the command itself does first."""
-    from lerobot_roborecover.cli import collect
-    from lerobot_roborecover.cli.main import build_parser
-
-    if argv[0] != "collect":
-        return build_parser().parse_args(argv)
-    parser = collect.build_parser()
-    args, rest = parser.parse_known_args(collect.pairs(argv[1:]))
-    collect.options(parser, args, rest).check()
-    return args
-
-
 def run(args: argparse.Namespace) -> int:
     """Builds, writes the summary, and prints the funnel."""
-    from lerobot_roborecover.cli.main import main
     from lerobot_roborecover.curation.pipeline.check import check_build
-    from lerobot_roborecover.curation.pipeline.commands import publish_command
     from lerobot_roborecover.curation.pipeline.config import read_config
     from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting
     from lerobot_roborecover.curation.pipeline.summary import write_summary
+    from lerobot_roborecover.curation.pipeline.work import Work
+    from lerobot_roborecover.curation.render import publish_next
     from lerobot_roborecover.words import next_line
 
     config = read_config(args.config)
-    if problems := check_build(config, parse):
+    if problems := check_build(config):
         listed = "\n".join(f"  - {problem}" for problem in problems)
         print(f"{args.config} cannot be built, and nothing was run:\n{listed}", file=sys.stderr)
         if not args.dry_run:
             return 2
-    chain = Chain(config, lambda argv: main(argv), lambda line: print(line, flush=True))
+    chain = Chain(config, Work(_annotate), lambda line: print(line, flush=True))
     waiting = ""
     try:
         done = chain.build(args.first, args.until, args.dry_run)
@@ -67,5 +55,11 @@ def run(args: argparse.Namespace) -> int:
         print(f"\nstopped: {waiting}")
         return 1
     if config.publish is None and not args.until:
-        print("\n" + next_line(publish_command(config, chain.places), "to publish"))
+        print("\n" + next_line(publish_next(chain.places.result), "to publish"))
     return 0
+
+
+def _annotate(candidates: Path, votes: Path, say: Callable[[str], None]) -> None:
+    from lerobot_roborecover.studio.automatic.run import annotate, session
+
+    annotate(session(candidates, votes), say)

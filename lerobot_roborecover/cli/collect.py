@@ -84,7 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
 def pass_through(argv: Sequence[str]) -> int:
     """Parses, collects, and prints the table."""
     from lerobot_roborecover.curation.collect.collection import collect, describe, plan
-    from lerobot_roborecover.words import counted, next_line
+    from lerobot_roborecover.words import counted
 
     parser = build_parser()
     args, rest = parser.parse_known_args(pairs(argv))
@@ -107,8 +107,6 @@ def pass_through(argv: Sequence[str]) -> int:
         return 0
     collected = collect(chosen, lambda line: print(line, file=sys.stderr))
     print(describe(collected))
-    if collected.out is not None:
-        print(next_line(["annotate", str(collected.out), "--annotator", "NAME"]))
     return 0 if collected.out is not None else 1
 
 
@@ -127,7 +125,7 @@ def pairs(argv: Sequence[str]) -> list[str]:
 def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]) -> CollectOptions:
     """What to collect, from parsed arguments and those that are LeRobot's."""
     from lerobot_roborecover.curation.collect.judge import Judging
-    from lerobot_roborecover.curation.collect.options import CollectOptions
+    from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
     from lerobot_roborecover.curation.collect.starts import parse_numbers
     from lerobot_roborecover.env.options import OptionError
     from lerobot_roborecover.platforms import platform_names
@@ -150,8 +148,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
     if kind not in platform_names():
         known = ", ".join(f"{ENV_PREFIX}{name}" for name in platform_names())
         raise OptionError(f"--env.type={kind or 'none'}: give one of {known}")
-    if args.frames != "none" and not args.frames.isdigit():
-        raise OptionError(f"--frames={args.frames}: none, or a side in pixels")
+    side = parse_side(args.frames)
     if not isinstance(args.rename_map, dict):
         raise OptionError(f"--rename_map={args.rename_map!r:.80}: a JSON object of observation keys")
     seeds = parse_numbers(args.seeds, "--seeds") if args.seeds else ()
@@ -173,7 +170,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         perturbed_steps=args.perturb_steps,
         judging=Judging(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
         seed=args.seed,
-        frames=0 if args.frames == "none" else int(args.frames),
+        frames=side,
         slots=args.slots,
         max_batch=args.max_batch,
         horizon=args.horizon,

@@ -61,7 +61,6 @@ def run(args: argparse.Namespace) -> int:
     """Chooses, runs, judges, writes; prints the funnel."""
     import json
 
-    from lerobot_roborecover.cli.progress import Progress
     from lerobot_roborecover.curation import donors
     from lerobot_roborecover.curation.normalisation import use_statistics_of
     from lerobot_roborecover.curation.policy_trials import env_config, read_trials, run_trials
@@ -69,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.datasets.schema import FOLDER
     from lerobot_roborecover.env.identity import policy_identity
     from lerobot_roborecover.env.trial_log import read_trial_log
+    from lerobot_roborecover.progress import Progress
     from lerobot_roborecover.scenario import ScenarioError
 
     if args.out.exists() and any(args.out.iterdir()):

@@ -47,11 +47,11 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, write_monitor_report
     from lerobot_roborecover.analysis.monitor_report import monitor_report
     from lerobot_roborecover.analysis.named_path import split_named
-    from lerobot_roborecover.cli.progress import Progress
     from lerobot_roborecover.curation.monitor_data.judging import judge_dataset
     from lerobot_roborecover.interventions.monitor.errors import MonitorError
     from lerobot_roborecover.interventions.monitor_interface import TrainedMonitor
     from lerobot_roborecover.interventions.monitor_loading import load_monitor
+    from lerobot_roborecover.progress import Progress
 
     if args.threshold is not None and args.choose_threshold:
         raise MonitorError("--threshold and --choose-threshold: give one of them")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.render import RenderRequest
 
 HELP = "Render every scenario's prefix as an episode, and write the whole as a LeRobotDataset."
 
@@ -24,12 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Renders, and says what to do with the result."""
-    from lerobot_roborecover.cli.progress import Progress
-    from lerobot_roborecover.curation.render import RenderRequest, render
-    from lerobot_roborecover.words import counted, next_line
+    from lerobot_roborecover.curation.render import describe, render
+    from lerobot_roborecover.progress import Progress
 
-    request = RenderRequest(args.dataset, args.out, args.frames, args.env, args.workers, args.work)
-    count = render(request, Progress("part"))
-    print(f"{counted(count, 'episode')} in {args.out}")
-    print(next_line(["publish", str(args.out), "--repo-id", "ORG/NAME"]))
+    asked = request(args)
+    print(describe(asked, render(asked, Progress("part"))))
     return 0
+
+
+def request(args: argparse.Namespace) -> RenderRequest:
+    """What to render, from parsed arguments."""
+    from lerobot_roborecover.curation.render import RenderRequest
+
+    return RenderRequest(args.dataset, args.out, args.frames, args.env, args.workers, args.work)

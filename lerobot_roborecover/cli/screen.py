@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.screen.dataset import ScreenRequest
 
 HELP = (
     "Run screening policies from every scenario's recovery point and keep the scenarios of intermediate "
@@ -66,21 +70,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Screens, and prints the tables and the funnel."""
-    from lerobot_roborecover.cli.progress import Progress
-    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
-    from lerobot_roborecover.curation.screen.dataset import ScreenRequest, screen_dataset, validate_next
+    from lerobot_roborecover.curation.screen.dataset import describe, screen_dataset
+    from lerobot_roborecover.progress import Progress
+
+    asked = request(args)
+    print(describe(asked, screen_dataset(asked, Progress("trial").of)))
+    return 0
+
+
+def request(args: argparse.Namespace) -> ScreenRequest:
+    """What to screen, from parsed arguments."""
+    from lerobot_roborecover.curation.screen.dataset import ScreenRequest
     from lerobot_roborecover.curation.screen.runs import parse_policies
-    from lerobot_roborecover.curation.screen.screening import ScreenRule, format_histogram, format_policies
-    from lerobot_roborecover.words import counted, next_line
+    from lerobot_roborecover.curation.screen.screening import ScreenRule
 
     policies, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
-    rule = ScreenRule(args.trials, tuple(args.keep), args.max_invalid)
-    request = ScreenRequest(
+    return ScreenRequest(
         dataset=args.dataset,
         policies=policies,
         out=args.out,
         trials_folder=args.trials_folder,
-        rule=rule,
+        rule=ScreenRule(args.trials, tuple(args.keep), args.max_invalid),
         deterministic=args.deterministic,
         run_seed=args.run_seed,
         env=env,
@@ -91,19 +101,3 @@ def run(args: argparse.Namespace) -> int:
         slots=args.slots,
         max_batch=args.max_batch,
     )
-    made = screen_dataset(request, Progress("trial").of)
-    if args.shard:
-        print(f"part {args.shard}: trials in {request.trials}; join with --trials-from {request.trials}")
-        return 0
-    low, high = rule.check(len(policies))
-    kept = sum(s.decision.verdict == "kept" for s in made.found)
-    print(
-        f"{kept} of {counted(len(made.found), 'scenario')} in {args.out}: {low} to {high} successes of "
-        f"{len(policies) * rule.trials} "
-        f"({counted(len(policies), 'policy')} x {counted(rule.trials, 'trial')})\n"
-    )
-    print(format_policies(made.found), end="\n\n")
-    print(format_histogram(made.found, rule), end="\n\n")
-    print(attrition_table(count_stages(read_decisions(args.out))))
-    print("\n" + next_line(validate_next(args.out, request.trials)))
-    return 0

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.split import SplitConfig
 
 HELP = "Divide a scenario dataset into splits without leakage, and say how balanced they are."
 
@@ -37,28 +41,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Divides, or checks, and reports."""
-    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
-    from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_sizes
-    from lerobot_roborecover.curation.split_dataset import check_splits, format_report, split_dataset
-    from lerobot_roborecover.words import next_line
+    from lerobot_roborecover.curation.split import parse_apart
+    from lerobot_roborecover.curation.split_dataset import (
+        check_splits,
+        describe,
+        format_report,
+        split_dataset,
+    )
 
-    apart = parse_apart(args.apart)
     if args.check:
-        report = check_splits(args.dataset, apart)
+        report = check_splits(args.dataset, parse_apart(args.apart))
         print(format_report(report))
         return 1 if report.leaks else 0
+    report = split_dataset(args.dataset, config(args), out=args.out, dry_run=args.dry_run, force=args.force)
+    if args.dry_run:
+        print(f"{format_report(report)}\ndry run: nothing was changed")
+    else:
+        print(describe(report, args.out or args.dataset))
+    return 0
+
+
+def config(args: argparse.Namespace) -> SplitConfig:
+    """How to divide, from parsed arguments."""
+    from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_sizes
+
+    apart = parse_apart(args.apart)
     named = {"train": args.train, "val": args.val, "test": args.test}
     sizes = parse_sizes({**{k: v for k, v in named.items() if v}, **dict(_pair(o) for o in args.others)})
-    config = SplitConfig(sizes, args.seed, apart)
-    report = split_dataset(args.dataset, config, out=args.out, dry_run=args.dry_run, force=args.force)
-    print(format_report(report))
-    if args.dry_run:
-        print("dry run: nothing was changed")
-    elif rows := count_stages(read_decisions(args.out or args.dataset)):
-        print(attrition_table(rows))
-    if not args.dry_run:
-        print(next_line(["render", str(args.out or args.dataset), "--out", "RENDERED"]))
-    return 0
+    return SplitConfig(sizes, args.seed, apart)
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.curation.validate.request import ValidationRequest
 
 HELP = (
     "Replay screening runs of every scenario and keep the scenarios whose recovery point comes back as it "
@@ -52,47 +56,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Validates, and prints the distribution and the funnel."""
-    from lerobot_roborecover.cli.progress import Progress
-    from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
-    from lerobot_roborecover.curation.validate.dataset import validate_dataset
-    from lerobot_roborecover.curation.validate.request import ValidationRequest
-    from lerobot_roborecover.curation.validate.validation import ValidationRule, format_validation
-    from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.words import next_line
+    from lerobot_roborecover.curation.validate.dataset import describe, validate_dataset
+    from lerobot_roborecover.progress import Progress
 
     if args.states:
         return _states(args)
+    asked = request(args)
+    print(describe(asked, validate_dataset(asked, Progress("replay"))))
+    return 0
+
+
+def request(args: argparse.Namespace) -> ValidationRequest:
+    """What to validate, from parsed arguments."""
+    from lerobot_roborecover.curation.validate.request import ValidationRequest, read_rejects
+    from lerobot_roborecover.curation.validate.validation import ValidationRule
+    from lerobot_roborecover.env.options import OptionError
+
     if args.trials_folder is None:
         raise OptionError("--trials-folder is missing: name the folder where roborecover screen kept trials")
-    rule = ValidationRule(
-        args.runs, args.seed, args.tolerance_mm, args.min_ssim, not args.no_frames, not args.no_outcomes
-    )
-    rejects = {**_read_rejects(args.rejects), **dict.fromkeys(args.reject, args.reason)}
-    request = ValidationRequest(
+    return ValidationRequest(
         dataset=args.dataset,
         trials_folder=args.trials_folder,
         out=args.out,
         candidates=args.candidates,
-        rule=rule,
+        rule=ValidationRule(
+            args.runs, args.seed, args.tolerance_mm, args.min_ssim, not args.no_frames, not args.no_outcomes
+        ),
         env=args.env,
-        rejects=rejects,
+        rejects=read_rejects(args.rejects) | dict.fromkeys(args.reject, args.reason),
         accepts=args.accept,
         by=args.by,
         workers=args.workers,
         limit_s=args.limit_s,
         work=args.work,
     )
-    made = validate_dataset(request, Progress("replay"))
-    print(format_validation(made.replays, made.decisions, rule), end="\n\n")
-    print(attrition_table(count_stages(read_decisions(args.out))))
-    print(f"\n{args.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out")
-    print(next_line(["split", str(args.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]))
-    return 0
 
 
 def _states(args: argparse.Namespace) -> int:
-    from lerobot_roborecover.cli.progress import Progress
     from lerobot_roborecover.curation.validate.states import write_states
+    from lerobot_roborecover.progress import Progress
 
     found = write_states(args.dataset, args.out, args.workers, Progress("replay"))
     print(
@@ -100,22 +102,3 @@ def _states(args: argparse.Namespace) -> int:
         f"distance from the recording {found.largest_mm:g} mm\n{args.out}"
     )
     return 0
-
-
-def _read_rejects(path: Path | None) -> dict[str, str]:
-    from lerobot_roborecover.scenario import ScenarioError
-
-    if path is None:
-        return {}
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        raise ScenarioError(f"--rejects {path} cannot be read: {err}") from None
-    found = {}
-    for number, line in enumerate(lines, 1):
-        one, _, reason = line.strip().partition(" ")
-        if one and not one.startswith("#"):
-            if not reason.strip():
-                raise ScenarioError(f"{path}, line {number}: {one:.140} has no reason; write: ID REASON")
-            found[one] = reason.strip()
-    return found

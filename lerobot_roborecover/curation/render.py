@@ -20,6 +20,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.words import counted, next_line
 from lerobot_roborecover.workers.jobs import JobPool
 
 SIZE = 256
@@ -86,6 +87,22 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
                 shutil.copyfile(path, folder / FOLDER / path.name)
     shutil.rmtree(work, ignore_errors=True)
     return len(scenarios)
+
+
+def describe(request: RenderRequest, episodes: int) -> str:
+    """What came of rendering, and the command that follows.
+
+    Args:
+        request: what was asked for.
+        episodes: number of them.
+    """
+    done = f"{counted(episodes, 'episode')} in {request.out}"
+    return f"{done}\n{next_line(publish_next(request.out))}"
+
+
+def publish_next(root: Path) -> list[str]:
+    """Arguments of the `publish` that follows, which is to be completed."""
+    return ["publish", str(root), "--repo-id", "ORG/NAME"]
 
 
 def check_size(size: int) -> None:

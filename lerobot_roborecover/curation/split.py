@@ -60,21 +60,32 @@ def parse_sizes(given: Mapping[str, str]) -> dict[str, int | float]:
     sizes: dict[str, int | float] = {}
     for name, text in given.items():
         try:
-            value: int | float = float(text) if "." in text else int(text)
+            sizes[name] = float(text) if "." in text else int(text)
         except ValueError:
-            value = -1
+            raise ScenarioError(_no_size(name, text)) from None
+    return check_sizes(sizes)
+
+
+def check_sizes(sizes: Mapping[str, int | float]) -> dict[str, int | float]:
+    """Checks sizes: counts, or fractions that add up to 1.
+
+    Raises:
+        ScenarioError: one is neither a count nor a fraction, or they are of both kinds.
+    """
+    for name, value in sizes.items():
         if not (0 < value < 1 if isinstance(value, float) else 0 <= value <= 10**9):
-            raise ScenarioError(
-                f"split {name!r:.40}: size {text!r:.40} is neither a count nor a fraction like 0.8"
-            )
-        sizes[name] = value
+            raise ScenarioError(_no_size(name, str(value)))
     if len(sizes) < 2:
         raise ScenarioError("name at least two splits, e.g. --train 800 --test 200 or --train 0.8 --test 0.2")
     if len({type(v) for v in sizes.values()}) > 1:
-        raise ScenarioError(f"sizes {dict(given)} mix counts and fractions; write one kind")
+        raise ScenarioError(f"sizes {dict(sizes)} mix counts and fractions; write one kind")
     if all(isinstance(v, float) for v in sizes.values()) and abs(sum(sizes.values()) - 1) > 1e-6:
-        raise ScenarioError(f"fractions {dict(given)} add up to {sum(sizes.values()):g}, not to 1")
-    return sizes
+        raise ScenarioError(f"fractions {dict(sizes)} add up to {sum(sizes.values()):g}, not to 1")
+    return dict(sizes)
+
+
+def _no_size(name: str, text: str) -> str:
+    return f"split {name!r:.40}: size {text!r:.40} is neither a count nor a fraction like 0.8"
 
 
 def parse_apart(text: str | None) -> tuple[str, ...] | None:

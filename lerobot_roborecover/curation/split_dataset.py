@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
+from lerobot_roborecover.curation.attrition import (
+    Decision,
+    attrition_table,
+    count_stages,
+    read_decisions,
+    record_decisions,
+)
 from lerobot_roborecover.curation.split import SplitConfig, apart_for, assign, groups_of, shared
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.contents import list_files
@@ -20,7 +26,7 @@ from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.whole import new_folder, write_whole
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.words import counted, next_line
 
 SPLIT_FILE = "split.json"
 SCHEMA_VERSION = 1
@@ -155,6 +161,18 @@ def format_report(report: SplitReport) -> str:
         for value, ids in found[:_SHOWN]:
             lines.append(f"  {value[:60]}: {', '.join(ids[:_SHOWN])}{', ...' if len(ids) > _SHOWN else ''}")
     return "\n".join(lines)
+
+
+def describe(report: SplitReport, root: Path) -> str:
+    """What came of a division: the report, the funnel where there is one, and the command that follows.
+
+    Args:
+        report: of `split_dataset`.
+        root: folder of the dataset that was divided, or of the divided copy.
+    """
+    rows = count_stages(read_decisions(root))
+    funnel = [attrition_table(rows)] if rows else []
+    return "\n".join((format_report(report), *funnel, next_line(["render", str(root), "--out", "RENDERED"])))
 
 
 def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[str]) -> None:

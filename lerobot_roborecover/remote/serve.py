@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,5 +163,4 @@ def main(argv: Sequence[str]) -> int:
     init_logging()
     logging.getLogger("websockets").setLevel(logging.WARNING)
     register_third_party_plugins()
-    sys.argv[:] = ["roborecover-serve", *argv]
-    return run_with_arguments(serve)
+    return run_with_arguments(serve, "roborecover-serve", argv)

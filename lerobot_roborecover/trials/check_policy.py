@@ -390,7 +390,6 @@ def main(argv: Sequence[str]) -> int:
 
     init_logging()
     register_third_party_plugins()
-    words = ["--check.json=true" if a == "--json" else a for a in argv]
-    # LeRobot's parser reads the process's own argument list, in several places.
-    sys.argv[:] = rewrite_env_argument(["roborecover-eval", *words])
-    return run_with_arguments(check)
+    long = ["--check.json=true" if a == "--json" else a for a in argv]
+    program, *words = rewrite_env_argument(["roborecover-eval", *long])
+    return run_with_arguments(check, program, words)

@@ -373,9 +373,8 @@ def main(argv: Sequence[str]) -> int:
 
     init_logging()
     register_third_party_plugins()
-    # LeRobot's parser reads the process's own argument list, in several places.
-    sys.argv[:] = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
-    return run_with_arguments(evaluate)
+    program, *words = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
+    return run_with_arguments(evaluate, program, words)
 
 
 def _long_names(argv: Sequence[str]) -> list[str]:

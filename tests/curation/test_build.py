@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
@@ -15,9 +15,13 @@ from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTE
 from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.curation.attrition import Decision, StageCounts, record_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.collect.collection import Collected
 from lerobot_roborecover.curation.pipeline.config import read_config
-from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting
+from lerobot_roborecover.curation.pipeline.requests import collect_options
+from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting, _key
 from lerobot_roborecover.curation.pipeline.summary import markdown
+from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.split import SplitConfig
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.env.options import OptionError
@@ -106,10 +110,11 @@ def test_the_example_can_be_read_and_tried(tmp_path, monkeypatch, capsys):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(OptionError, match=words):
             read_config(tmp_path / "bad.yaml")
+    chain = Chain(config, Work(lambda candidates, votes, say: None))
     with pytest.raises(OptionError, match="--from nowhere: not one of"):
-        Chain(config, lambda argv: 0).build("nowhere")
+        chain.build("nowhere")
     with pytest.raises(OptionError, match="come in the order"):
-        Chain(config, lambda argv: 0).build("split", "collect")
+        chain.build("split", "collect")
 
 
 def test_the_funnel_as_markdown():
@@ -120,7 +125,7 @@ def test_the_funnel_as_markdown():
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    """A chain whose commands only make their folders, and whose candidates are there."""
+    """A chain whose stages only make their folders, and whose candidates are there."""
     from tests.support.candidate_files import candidate_dataset
 
     monkeypatch.setattr(
@@ -133,21 +138,28 @@ def stand_in(tmp_path, monkeypatch):
         "collect": {"mine": {"dataset": str(tmp_path / "rollouts")}},
         "screen": {"policies": [{"path": "p"}]}, "split": {"sizes": {"train": 0.5, "test": 0.5}},
     }  # fmt: skip
-    calls: list[list[str]] = []
+    asked: dict[str, tuple] = {}
 
-    def command(argv: list[str]) -> int:
-        calls.append(argv)
-        if "--out" in argv:
-            Path(argv[argv.index("--out") + 1]).mkdir()
-        return build.status
+    def stand_in(name: str):
+        def work(*given) -> None:
+            asked[name] = given
+            if name in build.broken:
+                raise OptionError("it cannot")
+            out = given[2] if name == "split" else getattr(given[0], "out", None)
+            if out is not None and name not in build.empty:
+                out.mkdir()
+
+        return work
 
     def build(*args, content=content, **kwargs) -> list[str]:
-        calls.clear()
+        asked.clear()
         config = read_config(write(tmp_path / "build.yaml", content))
-        Chain(config, command, lambda line: None).build(*args, **kwargs)
-        return [argv[0] for argv in calls]
+        work = Work(**{f.name: stand_in(f.name) for f in fields(Work)})
+        Chain(config, work, lambda line: None).build(*args, **kwargs)
+        return list(asked)
 
-    build.root, build.content, build.calls, build.status = tmp_path / "out", content, calls, 0
+    build.root, build.content, build.asked = tmp_path / "out", content, asked
+    build.broken, build.empty = set(), set()
     return build
 
 
@@ -162,29 +174,28 @@ def test_what_runs_again(stand_in):
     assert build(dry_run=True) == []
     assert build("", "agree") == ["agree"]
     assert build() == ["screen", "validate", "split", "render"]
-    assert build.calls[0][:5] == [
-        "screen",
-        str(build.root / "scenarios"),
-        "--out",
-        str(build.root / "screened"),
-        "--policy",
-    ]
+    screened = build.asked["screen"][0]
+    assert (screened.dataset, screened.out) == (str(build.root / "scenarios"), build.root / "screened")
+    assert [policy.path for policy in screened.policies] == ["p"]
+    assert build.asked["split"][:3] == (
+        build.root / "validated", SplitConfig({"train": 0.5, "test": 0.5}), build.root / "split",
+    )  # fmt: skip
     assert build() == []
     assert build("validate") == ["validate", "split", "render"]
     assert build("", "screen") == []
     seed = changed(build.content, "split.seed", 7)
     assert build(content=seed) == ["split", "render"]
-    assert build.calls[0][-2:] == ["--seed", "7"]
+    assert build.asked["split"][1].seed == 7
     assert build(content=changed(seed, "screen.slots", 9)) == [], "a pace is no change"
     assert build(content=changed(seed, "screen.keep", [2, 18])) == ["screen", "validate", "split", "render"]
-    assert build.calls[0][-3:] == ["--keep", "2", "18"]
+    assert build.asked["screen"][0].rule.keep == ("2", "18")
     assert build(content=changed(seed, "screen.keep", [0.1, 0.9])) == [
         "screen",
         "validate",
         "split",
         "render",
     ]
-    assert build.calls[0][-3:] == ["--keep", "0.1", "0.9"]
+    assert build.asked["screen"][0].rule.keep == ("0.1", "0.9")
     build(content=seed)
     assert build(content=changed(seed, "publish.repo_id", "a/b"))[-1] == "publish"
     # Votes, rejections and decisions of people count; a result that is gone is made again.
@@ -210,13 +221,71 @@ def test_a_stage_that_ends_in_an_error_is_not_recorded(stand_in):
     with pytest.raises(Waiting):
         build()
     vote_for_all(build.root)
-    build.status = 2
-    with pytest.raises(ScenarioError, match="`roborecover agree` ended with status 2"):
+    build.broken = {"agree"}
+    with pytest.raises(
+        ScenarioError, match=r"^agree: it cannot\. What had finished is kept: run build again$"
+    ):
         build()
-    build.status = 0
+    build.broken = set()
     assert build() == ["agree", "screen", "validate", "split", "render"]
     with Journal(build.root / "stages.jsonl", 1), pytest.raises(ScenarioError, match="in use by another"):
         build()
+
+
+def test_rollouts_of_which_nothing_is_kept_do_not_end_a_build(stand_in, monkeypatch, capsys):
+    """The other ways may still give candidates."""
+    build = stand_in
+    content = changed(build.content, "collect.none", {"expert": "expert_biased", "draw": 1})
+    build.empty = {"collect"}
+    with pytest.raises(Waiting, match="3 candidates wait"):
+        build(content=content)
+    options = build.asked["collect"][0]
+    assert options.out == build.root / "collect" / "none"
+    nothing = Collected(None, (), 0)
+    monkeypatch.setattr("lerobot_roborecover.curation.collect.collection.collect", lambda *_: nothing)
+    lines: list[str] = []
+    Work(lambda candidates, votes, say: None).collect(options, lines.append)
+    assert "no rollout was kept" in lines[0]
+
+
+KEYS = {
+    "collect shaken": "4e9e296ce235078c",
+    "join": "b8d04bb8dbad67dc",
+    "annotate": "19a5744229e8c820",
+    "agree": "2eae0a3c09eab43d",
+    "screen": "776cc8b37f2e9d69",
+    "validate": "6ad608f972dece81",
+    "split": "9f33d9939329298f",
+    "render": "87b09115984adca6",
+    "publish": "65b98dfdfc5ab7f2",
+}
+"""By stage: the beginning of what was written into `stages.jsonl`."""
+
+
+@pytest.mark.lerobot
+def test_a_build_of_an_earlier_version_is_up_to_date(tmp_path):
+    content = {
+        "out": "nowhere/out", "platform": "fake",
+        "collect": {
+            "shaken": {
+                "expert": "expert_biased", "task": ["push-*"], "draw": 4, "perturb": True, "frames": 32,
+            },
+        },
+        "screen": {
+            "policies": [{"path": "nowhere/act", "name": "act", "options": {"n_action_steps": 5}}],
+            "trials": 2, "keep": [0.1, 0.9],
+        },
+        "validate": {"runs": 2, "workers": 2}, "split": {"sizes": {"train": 0.5, "test": 0.5}, "seed": 7},
+        "render": {"frames": 64}, "publish": {"repo_id": "org/name"},
+    }  # fmt: skip
+    config = read_config(write(tmp_path / "build.yaml", content))
+    found, key = {}, ""
+    for stage in Chain(config, Work(lambda candidates, votes, say: None))._stages():
+        key = _key(key, stage)
+        found[stage.label] = key[:16]
+    assert found == KEYS
+    options = collect_options(config, "shaken", config.collect["shaken"], Path("out/shaken"))
+    assert options.work == Path("out/shaken.work-766c56a0"), "rollouts that are there are used again"
 
 
 def vote_for_all(root: Path) -> int:

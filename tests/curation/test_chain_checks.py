@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.build import parse
-from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.cli.main import build_parser, main
 from lerobot_roborecover.curation.pipeline.check import check_build
 from lerobot_roborecover.curation.pipeline.config import read_config
 from lerobot_roborecover.curation.pipeline.stages import Chain, Pace, Waiting
+from lerobot_roborecover.curation.pipeline.work import Work
 from lerobot_roborecover.curation.render import RenderRequest, render
 from lerobot_roborecover.curation.screen.dataset import validate_next
 from lerobot_roborecover.curation.validate.dataset import reject_next
@@ -49,7 +49,7 @@ def problems(tmp_path, policy):
 
     def check(key: str = "", value=None) -> list[str]:
         content = changed(good, key, value) if key else good
-        return check_build(read_config(write(tmp_path / "build.yaml", content)), parse)
+        return check_build(read_config(write(tmp_path / "build.yaml", content)))
 
     check.good, check.root = good, tmp_path
     return check
@@ -67,6 +67,8 @@ def problems(tmp_path, policy):
             "screen.policies.0: checkpoint 'nowhere/at-all' is neither",
         ),
         ("screen.env", {"obs_typ": "state"}, "screen: "),
+        ("screen.env", {"start": "initial"}, "screen: --env start=initial: screening settles this itself"),
+        ("screen.policies", [{"path": "p", "name": "a b"}], "screen: policy name 'a b' is not"),
         ("collect.biased.frames", 33, "frames: 33; video has an even side"),
         ("collect.biased.frames", 48, "frame sizes differ (biased 48 x 48, shaken 32 x 32)"),
         ("collect.biased.frames", "none", "collect.biased.frames: none"),
@@ -134,7 +136,8 @@ def accepted(line: str) -> list[str]:
     """The command of a line, after its parser has taken it."""
     _, _, command = line.partition("roborecover ")
     argv = shlex.split(command)
-    parse(argv) if argv[0] != "collect" else None
+    if argv[0] != "collect":
+        build_parser().parse_args(argv)
     return argv
 
 
@@ -149,7 +152,7 @@ def test_every_next_line_is_accepted_by_the_parser_of_its_command(tmp_path, monk
         bare, out / "trials", out / "validated", [out / "a", out / "b"], env=["obs_type=state"]
     )
     argv = accepted(f"roborecover {shlex.join(reject_next(request))}")
-    args = parse(argv)
+    args = build_parser().parse_args(argv)
     assert (args.dataset, args.candidates, args.reject) == (bare, [out / "a", out / "b"], ["ID"])
     assert (args.runs, args.seed, args.tolerance_mm, args.min_ssim) == (3, 42, 2.0, 0.99)
 
@@ -175,7 +178,8 @@ def test_a_build_that_waits_names_a_command_that_is_accepted(tmp_path, monkeypat
         "screen": {"policies": [{"path": "p"}]}, "split": {"sizes": {"train": 0.5, "test": 0.5}},
     }  # fmt: skip
     lines: list[str] = []
-    chain = Chain(read_config(write(tmp_path / "b.yaml", content)), lambda argv: 0, lines.append)
+    work = Work(lambda candidates, votes, say: None)
+    chain = Chain(read_config(write(tmp_path / "b.yaml", content)), work, lines.append)
     with pytest.raises(Waiting, match="1 candidate waits for votes") as caught:
         chain.build()
     assert accepted(str(caught.value).splitlines()[-1])[0] == "annotate"

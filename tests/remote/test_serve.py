@@ -274,8 +274,7 @@ def test_the_command_serves_and_stops_at_ctrl_c(checkpoints, openpi_client):
         process.stdout.close()
 
 
-def test_serve_refuses_in_one_line(checkpoints, act, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["roborecover"])
+def test_serve_refuses_in_one_line(checkpoints, act, capsys):
     policy = [f"--policy.path={checkpoints['act']}", "--policy.device=cpu"]
     port = act[0].rpartition(":")[2]
     for arguments, words in (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -177,11 +176,10 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture
-def run(dataset, monkeypatch, capfd, tmp_path):
+def run(dataset, capfd, tmp_path):
     """Runs a command on a checkpoint; returns its status, stdout and stderr."""
 
     def call(command: str, policy: Path, *args: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["roborecover"])
         capfd.readouterr()
         extra = (f"--output_dir={tmp_path / 'out'}",) if command == "eval" else ()
         status = main([

@@ -46,11 +46,10 @@ def arguments(dataset, policy):
 
 
 @pytest.fixture
-def run(arguments, tmp_path, monkeypatch):
+def run(arguments, tmp_path):
     """Runs the command in this process; returns its output folder."""
 
     def call(*extra: str, out: str = "out", status: int = 0) -> Path:
-        monkeypatch.setattr(sys, "argv", ["roborecover"])
         assert main(["eval", *arguments, f"--output_dir={tmp_path / out}", *extra]) == status
         return tmp_path / out
 

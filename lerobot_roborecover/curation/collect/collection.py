@@ -31,7 +31,7 @@ from lerobot_roborecover.env.run import PlatformPart
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.scenario import ScenarioError, Task
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.words import counted, next_line
 
 if TYPE_CHECKING:
     from lerobot_roborecover.env.configs import RecoveryEnvConfig
@@ -94,10 +94,11 @@ def collect(options: CollectOptions, say: Callable[[str], None] = print) -> Coll
 
 
 def describe(collected: Collected) -> str:
-    """The final table."""
+    """The final table, and the command that follows."""
     lines = [attrition_table(collected.rows)] if collected.rows else []
     if collected.out is not None:
         lines.append(f"\n{counted(collected.candidates, 'candidate')} in {collected.out}")
+        lines.append(next_line(["annotate", str(collected.out), "--annotator", "NAME"]))
     else:
         lines.append("\nno rollout was kept, so no dataset was written")
     return "\n".join(lines)

@@ -9,12 +9,21 @@ from pathlib import Path
 from lerobot_roborecover.curation.collect.exclusions import check_rules
 from lerobot_roborecover.curation.collect.experts import check_expert
 from lerobot_roborecover.curation.collect.judge import Judging
-from lerobot_roborecover.curation.collect.starts import (
-    Starts,
-)
+from lerobot_roborecover.curation.collect.starts import Starts
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
+
+
+def parse_side(text: str) -> int:
+    """Side of the pictures in pixels, as it is written; 0 for `none`.
+
+    Raises:
+        OptionError: it is neither.
+    """
+    if text != "none" and not text.isdigit():
+        raise OptionError(f"--frames={text}: none, or a side in pixels")
+    return 0 if text == "none" else int(text)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,11 @@ are reported together.
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import os
 import re
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,14 +18,15 @@ from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import check_name
 from lerobot_roborecover.curation.candidates import read_candidates
-from lerobot_roborecover.curation.pipeline.commands import COMMANDS, Places, annotate_command, collect_command
+from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig
+from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.pipeline.requests import assignments
+from lerobot_roborecover.curation.render import check_size
+from lerobot_roborecover.curation.screen.screening import ScreenRule
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
-
-type Parse = Callable[[list[str]], argparse.Namespace]
-"""Parses and checks `roborecover ARGV`; raises OptionError or ScenarioError."""
 
 _REPO = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _SIZE = 256
@@ -51,12 +51,11 @@ class _Problems:
             self.found.append(f"{where}: {last.partition('error: ')[2] or last}")
 
 
-def check_build(config: ChainConfig, parse: Parse) -> list[str]:
+def check_build(config: ChainConfig) -> list[str]:
     """What stands against a build.
 
     Args:
         config: the whole file.
-        parse: takes a stage's command apart and checks its options.
 
     Returns:
         Problems, one a line, each with its place in the file; empty where there are none.
@@ -69,32 +68,27 @@ def check_build(config: ChainConfig, parse: Parse) -> list[str]:
             if part.dataset:
                 _check_dataset(Path(part.dataset), config.platform)
             else:
-                parse(collect_command(config, name, part, places.collected(name)))
+                requests.collect_options(config, name, part, places.collected(name)).check()
         if part.policy:
             with problems.of(f"{where}.policy"):
                 check_checkpoint(part.policy, part.policy_options)
     with problems.of("collect"):
         _check_sizes(config)
     with problems.of("annotate"):
-        parse(annotate_command(config, places))
         _check_votes(places.votes, named=bool(config.annotate.votes))
-    parsed: dict[str, argparse.Namespace] = {}
-    for name, command in COMMANDS.items():
-        if getattr(config, name, "agree") is not None:
-            with problems.of(name):
-                parsed[name] = parse(command(config, places))
-    if "screen" in parsed:
-        _check_screen(problems, config, parsed["screen"])
-    if "validate" in parsed:
-        _check_validate(problems, config, parsed["validate"])
-    if "split" in parsed:
-        _check_split(problems, parsed["split"])
+    _check_screen(problems, config, places)
+    with problems.of("validate"):
+        rejects = config.validate.rejects
+        if rejects and not Path(rejects).is_file():
+            raise OptionError(f"rejects {rejects} is not there")
+        _check_env(config.platform, requests.validation_request(config, places).env)
+    with problems.of("split"):
+        requests.split_config(config)
     if config.render is not None:
         with problems.of("render"):
-            from lerobot_roborecover.curation.render import SIZE, check_size
-
-            check_size(config.render.frames or SIZE)
-            _check_env(config.platform, [f"{k}={v}" for k, v in config.render.env.items()])
+            render = requests.render_request(config, places)
+            check_size(render.size)
+            _check_env(config.platform, render.env)
     if config.publish is not None:
         with problems.of("publish"):
             _check_publish(config)
@@ -114,11 +108,10 @@ def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
     from lerobot.policies import get_policy_class
     from safetensors import SafetensorError, safe_open
 
-    from lerobot_roborecover.curation.pipeline.commands import text
     from lerobot_roborecover.trials.load import policy_config
 
     try:
-        config = policy_config(path, [f"{k}={text(v)}" for k, v in options.items()])
+        config = policy_config(path, assignments(options))
         get_policy_class(config.type)
     except (OptionError, ScenarioError):
         raise
@@ -188,17 +181,16 @@ def _check_votes(folder: Path, *, named: bool) -> None:
         check_name(path.stem)
 
 
-def _check_screen(problems: _Problems, config: ChainConfig, args: argparse.Namespace) -> None:
-    from lerobot_roborecover.curation.screen.runs import check_policies, parse_policies
-    from lerobot_roborecover.curation.screen.screening import ScreenRule
-
+def _check_screen(problems: _Problems, config: ChainConfig, places: Places) -> None:
+    rule = ScreenRule()
     with problems.of("screen.keep"):
-        ScreenRule(args.trials, tuple(args.keep), args.max_invalid).check(len(config.screen.policies))
+        rule = requests.screen_rule(config)
+        rule.check(len(config.screen.policies))
     with problems.of("screen"):
-        specs, env = parse_policies(args.policy, args.policy_option, args.env, args.rename_map)
-        check_policies(specs)
-        for one in [[], *(spec.env for spec in specs)]:
-            _check_env(config.platform, [*env, *one])
+        request = requests.screen_request(config, places, rule)
+        request.check()
+        for one in [(), *(spec.env for spec in request.policies)]:
+            _check_env(config.platform, [*request.env, *one])
     for number, policy in enumerate(config.screen.policies):
         with problems.of(f"screen.policies.{number}"):
             check_checkpoint(policy.path, policy.options)
@@ -214,24 +206,6 @@ def _check_env(platform: str, options: Sequence[str]) -> None:
         env_config(platform, "none", [f"--{o.removeprefix('--')}" for o in options])
     except (draccus.utils.DraccusException, ValueError, TypeError) as err:
         raise OptionError(f"env: {' '.join(str(err).split())}") from None
-
-
-def _check_validate(problems: _Problems, config: ChainConfig, args: argparse.Namespace) -> None:
-    from lerobot_roborecover.curation.validate.validation import ValidationRule
-
-    with problems.of("validate"):
-        ValidationRule(args.runs, args.seed, args.tolerance_mm, args.min_ssim)
-        _check_env(config.platform, args.env)
-        if args.rejects is not None and not args.rejects.is_file():
-            raise OptionError(f"rejects {args.rejects} is not there")
-
-
-def _check_split(problems: _Problems, args: argparse.Namespace) -> None:
-    from lerobot_roborecover.curation.split import parse_apart, parse_sizes
-
-    with problems.of("split"):
-        parse_sizes(dict(pair.split("=", 1) for pair in args.others))
-        parse_apart(args.apart)
 
 
 def _check_publish(config: ChainConfig) -> None:

@@ -1,7 +1,7 @@
 """The whole chain from one file: collect, join, annotate, agree, screen, validate, split, render,
 publish.
 
-Each stage is a command on a folder of its own below `out`; `stages.jsonl` records what each finished stage
+Each stage makes a folder of its own below `out`; `stages.jsonl` records what each finished stage
 was made from. A stage whose options and inputs are unchanged is not run again; one that is changed has its
 old result moved to `old/` first, and everything after it is made anew. What takes long (rollouts, votes,
 trials, replays) is kept beside the results and goes on where it was.
@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -25,13 +24,15 @@ from typing import Any
 from lerobot_roborecover.curation.attrition import read_decisions
 from lerobot_roborecover.curation.candidates import CANDIDATES_FILE, STEPS_FILE, read_candidates
 from lerobot_roborecover.curation.candidates_write import merge_candidates
-from lerobot_roborecover.curation.pipeline import commands
-from lerobot_roborecover.curation.pipeline.commands import Places
+from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig
-from lerobot_roborecover.curation.resolution import ResolutionConfig, queued, resolve, write_discussion
+from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.resolution import queued, resolve, write_discussion
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.write import file_sha256
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.journal import Journal, read_journal
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_folder
@@ -39,14 +40,9 @@ from lerobot_roborecover.words import counted, lasting, next_line
 
 STAGES = ("collect", "join", "annotate", "agree", "screen", "validate", "split", "render", "publish")
 JOURNAL_FILE = "stages.jsonl"
-NOTHING_KEPT = 1
-"""Exit status of a collection of which nothing was kept: the others may still give candidates."""
 _SCHEMA = 1
 _PACE = ("slots", "workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
-
-type RunCommand = Callable[[list[str]], int]
-"""Runs `roborecover ARGV` and gives its exit status."""
 
 
 class Waiting(Exception):
@@ -101,12 +97,12 @@ class Chain:
 
     Args:
         config: what.
-        run: runs a command.
+        work: the stages' functions.
         say: takes lines for people.
     """
 
     config: ChainConfig
-    run: RunCommand
+    work: Work
     say: Callable[[str], None] = print
     places: Places = field(init=False)
 
@@ -159,7 +155,7 @@ class Chain:
                     # what the others make is made anew, from what they keep beside it.
                     if stage.name != "collect" or stage.label in known:
                         self._set_aside(stage.out)
-                    stage.work()
+                    self._run(stage)
                     seconds = time.monotonic() - began
                     at = datetime.now(UTC).isoformat(timespec="seconds")
                     note = {"label": stage.label, "key": key, "seconds": round(seconds, 1), "at": at}
@@ -179,15 +175,19 @@ class Chain:
 
     def _stages(self) -> Iterator[Stage]:
         """The stages in order; each is asked for its inputs only when its turn has come."""
-        config, places = self.config, self.places
+        config, places, work = self.config, self.places, self.work
         for name, part in config.collect.items():
             if part.dataset:
                 self._existing(name, Path(part.dataset))
                 continue
             out = places.collected(name)
-            argv = commands.collect_command(config, name, part, out)
+            options = requests.collect_options(config, name, part, out)
             yield Stage(
-                "collect", f"collect {name}", out, _options(part), lambda argv=argv: self._command(argv)
+                "collect",
+                f"collect {name}",
+                out,
+                _options(part),
+                lambda options=options: work.collect(options, self.say),
             )
         inputs = [Path(p.dataset) if p.dataset else places.collected(n) for n, p in config.collect.items()]
         yield Stage(
@@ -195,32 +195,68 @@ class Chain:
         )
         yield Stage("annotate", "annotate", None, None, self._annotate, not self._open())
         votes = {p.name: file_sha256(p) for p in sorted(places.votes.glob("*.jsonl"))}
-        yield self._simple("agree", places.scenarios, [_options(config.annotate), votes, config.license])
-        yield self._simple("screen", places.screened, _options(config.screen))
+        yield Stage(
+            "agree",
+            "agree",
+            places.scenarios,
+            [_options(config.annotate), votes, config.license],
+            lambda: work.agree(requests.agree_request(config, places), self.say),
+        )
+        yield Stage(
+            "screen",
+            "screen",
+            places.screened,
+            _options(config.screen),
+            lambda: work.screen(
+                requests.screen_request(config, places, requests.screen_rule(config)), self.say
+            ),
+        )
         rejects = Path(config.validate.rejects) if config.validate.rejects else None
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"
         # `validate` itself leaves an empty record of rejections behind.
         looked = [file_sha256(p) for p in (rejects, people) if p and p.is_file() and p.stat().st_size]
-        yield self._simple("validate", places.validated, [_options(config.validate), looked])
-        yield self._simple("split", places.split, _options(config.split))
+        yield Stage(
+            "validate",
+            "validate",
+            places.validated,
+            [_options(config.validate), looked],
+            lambda: work.validate(requests.validation_request(config, places), self.say),
+        )
+        yield Stage(
+            "split",
+            "split",
+            places.split,
+            _options(config.split),
+            lambda: work.split(places.validated, requests.split_config(config), places.split, self.say),
+        )
         if config.render is not None:
-            yield self._simple("render", places.rendered, _options(config.render))
-        if config.publish is not None:
-            yield self._simple("publish", None, _options(config.publish))
-
-    def _simple(self, name: str, out: Path | None, identity: Any) -> Stage:
-        """A stage that is one command on the result of the one before."""
-        command = commands.COMMANDS[name]
-        return Stage(name, name, out, identity, lambda: self._command(command(self.config, self.places)))
-
-    def _command(self, argv: list[str], fine: tuple[int, ...] = (0,)) -> None:
-        self.say(f"$ roborecover {shlex.join(argv)}")
-        status = self.run(argv)
-        if status not in fine:
-            raise ScenarioError(
-                f"`roborecover {argv[0]}` ended with status {status}; what it said is above. What "
-                "had finished is kept: run build again"
+            yield Stage(
+                "render",
+                "render",
+                places.rendered,
+                _options(config.render),
+                lambda: work.render(requests.render_request(config, places), self.say),
             )
+        if (publish := config.publish) is not None:
+            yield Stage(
+                "publish",
+                "publish",
+                None,
+                _options(publish),
+                lambda: work.publish(requests.publish_request(publish, places), self.say),
+            )
+
+    def _run(self, stage: Stage) -> None:
+        """Runs a stage.
+
+        Raises:
+            Waiting: people have to do something first.
+            ScenarioError: it cannot run; says which it is, and how to go on.
+        """
+        try:
+            stage.work()
+        except RoboRecoverError as err:
+            raise ScenarioError(f"{stage.label}: {err}. What had finished is kept: run build again") from err
 
     def _set_aside(self, out: Path | None) -> None:
         """Moves an earlier result out of the way; nothing is deleted."""
@@ -253,11 +289,6 @@ class Chain:
         joined = f"{counted(total, 'candidate')} of {counted(len(present), 'dataset')}"
         self.say(f"{joined} in {self.places.candidates}")
 
-    def _rule(self) -> ResolutionConfig:
-        part = self.config.annotate
-        no_consensus = "discuss" if part.no_consensus == "discuss" else "drop"  # checked when it was read
-        return ResolutionConfig(part.votes_needed, part.tolerance, no_consensus)
-
     def _open(self) -> dict[str, int]:
         """Candidates that are not settled, by why."""
         if not self.places.candidates.exists():
@@ -265,7 +296,7 @@ class Chain:
         candidates = read_candidates(self.places.candidates)
         if not any(p.stat().st_size for p in self.places.votes.glob("*.jsonl")):
             return {"waiting": len(queued(candidates))}
-        found = resolve(candidates, self.places.votes, self._rule())
+        found = resolve(candidates, self.places.votes, requests.resolution_config(self.config))
         counts = found.counts()
         names = ["waiting"] + (["no consensus"] if self.config.annotate.no_consensus == "discuss" else [])
         if counts.get("no consensus") and "no consensus" in names:
@@ -275,7 +306,7 @@ class Chain:
     def _annotate(self) -> None:
         waiting = self._open()
         if waiting.get("waiting") and self.config.annotate.automatic:
-            self._command(commands.annotate_command(self.config, self.places))
+            self.work.annotate(self.places.candidates, self.places.votes, self.say)
             waiting = self._open()
         if not waiting:
             return

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.screen.runs import (
     PolicySpec,
     check_policies,
@@ -16,6 +17,8 @@ from lerobot_roborecover.curation.screen.runs import (
 from lerobot_roborecover.curation.screen.screening import (
     Screened,
     ScreenRule,
+    format_histogram,
+    format_policies,
     histogram,
     provenance_of,
     screen,
@@ -27,6 +30,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import check_new
+from lerobot_roborecover.words import counted, next_line
 
 SCREENING_FILE = "screening.json"
 
@@ -63,6 +67,26 @@ class ScreenRequest:
         """The trials' folder."""
         return self.trials_folder or self.out.with_name(f"{self.out.name}.trials")
 
+    def check(self) -> None:
+        """Checks what can be checked without scenarios, but for the rule, which `rule.check` does.
+
+        Raises:
+            OptionError: policies cannot be told apart, or an option is not one for screening.
+        """
+        check_policies(self.policies)
+        unknown = set(self.deterministic) - {p.name for p in self.policies}
+        if unknown:
+            raise OptionError(
+                f"--deterministic {' '.join(sorted(unknown))}: not among the policies "
+                f"{', '.join(p.name for p in self.policies)}"
+            )
+        for option in (*self.env, *(o for p in self.policies for o in p.env)):
+            if option.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
+                raise OptionError(
+                    f"--env {option}: screening settles this itself"
+                    + ("; use --shard" if option.startswith("shard") else "")
+                )
+
 
 @dataclass(frozen=True)
 class Screening:
@@ -88,19 +112,7 @@ def screen_dataset(
         OptionError, ScenarioError: the request makes no sense, or no scenario stays.
         SimulatorError, TrialLogError: what `roborecover eval` refuses.
     """
-    check_policies(request.policies)
-    unknown = set(request.deterministic) - {p.name for p in request.policies}
-    if unknown:
-        raise OptionError(
-            f"--deterministic {' '.join(sorted(unknown))}: not among the policies "
-            f"{', '.join(p.name for p in request.policies)}"
-        )
-    for option in (*request.env, *(o for p in request.policies for o in p.env)):
-        if option.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
-            raise OptionError(
-                f"--env {option}: screening settles this itself"
-                + ("; use --shard" if option.startswith("shard") else "")
-            )
+    request.check()
     request.rule.check(len(request.policies))
     if not request.shard:
         check_new(request.out)
@@ -134,6 +146,25 @@ def screen_dataset(
         scenarios.manifest,
     )
     return Screening(found, rows)
+
+
+def describe(request: ScreenRequest, made: Screening) -> str:
+    """What came of a screening: the tables, the funnel, and the command that follows."""
+    if request.shard:
+        return f"part {request.shard}: trials in {request.trials}; join with --trials-from {request.trials}"
+    rule, policies = request.rule, len(request.policies)
+    low, high = rule.check(policies)
+    kept = sum(s.decision.verdict == "kept" for s in made.found)
+    head = (
+        f"{kept} of {counted(len(made.found), 'scenario')} in {request.out}: {low} to {high} successes of "
+        f"{policies * rule.trials} ({counted(policies, 'policy')} x {counted(rule.trials, 'trial')})"
+    )
+    tables = (
+        format_policies(made.found),
+        format_histogram(made.found, rule),
+        attrition_table(count_stages(read_decisions(request.out))),
+    )
+    return "\n\n".join((head, *tables, next_line(validate_next(request.out, request.trials))))
 
 
 def validate_next(out: Path, trials: Path) -> list[str]:

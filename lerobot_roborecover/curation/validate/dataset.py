@@ -13,7 +13,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import STAGES, Decision, read_decisions
+from lerobot_roborecover.curation.attrition import (
+    STAGES,
+    Decision,
+    attrition_table,
+    count_stages,
+    read_decisions,
+)
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.curation.validate.jobs import make_jobs, read_screening, simulator_versions
@@ -24,6 +30,7 @@ from lerobot_roborecover.curation.validate.sheets import write_page
 from lerobot_roborecover.curation.validate.validation import (
     CRASH,
     Replays,
+    format_validation,
     judge,
     replays_from,
 )
@@ -34,6 +41,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.words import next_line
 from lerobot_roborecover.workers.jobs import Done, JobPool, Outcome
 from lerobot_roborecover.workers.messages import SlotFailure
 
@@ -97,6 +105,18 @@ def validate_dataset(
     both = [*decisions.values(), *(final[i] for i in rejected if final[i] != decisions[i])]
     _write(request, kept, both, record, manifest)
     return Validation(replays, list(final.values()), page)
+
+
+def describe(request: ValidationRequest, made: Validation) -> str:
+    """What came of a validation: the distribution, the funnel, and the command that follows."""
+    return "\n".join(
+        (
+            format_validation(made.replays, made.decisions, request.rule) + "\n",
+            attrition_table(count_stages(read_decisions(request.out))),
+            f"\n{request.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out",
+            next_line(["split", str(request.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]),
+        )
+    )
 
 
 def reject_next(request: ValidationRequest) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_roborecover.curation.validate.validation import ValidationRule
+from lerobot_roborecover.scenario import ScenarioError
 
 
 @dataclass(frozen=True)
@@ -40,3 +41,31 @@ class ValidationRequest:
     def folder(self) -> Path:
         """The working folder."""
         return self.work or self.out.with_name(f"{self.out.name}.replays")
+
+
+def read_rejects(path: Path | None) -> dict[str, str]:
+    """Rejections from a file: a line each, the id, a blank, the reason; lines that begin with # are left out.
+
+    Args:
+        path: the file; None holds none.
+
+    Returns:
+        Reasons by id.
+
+    Raises:
+        ScenarioError: it cannot be read, or an id has no reason.
+    """
+    if path is None:
+        return {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise ScenarioError(f"--rejects {path} cannot be read: {err}") from None
+    found = {}
+    for number, line in enumerate(lines, 1):
+        one, _, reason = line.strip().partition(" ")
+        if one and not one.startswith("#"):
+            if not reason.strip():
+                raise ScenarioError(f"{path}, line {number}: {one:.140} has no reason; write: ID REASON")
+            found[one] = reason.strip()
+    return found

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from multiprocessing.connection import wait
+from pathlib import Path
 
 from lerobot_roborecover.curation.annotation.annotators import EYES
 from lerobot_roborecover.scenario import ScenarioError
@@ -24,6 +25,20 @@ START_S = 120.0
 VIEWPORT = {"width": 900, "height": 640}
 """Nobody looks at it, and painting is what costs."""
 _SAY_EVERY = 20
+
+
+def session(
+    dataset: Path, votes: Path | None = None, seed: int = 0, only: Path | None = None
+) -> AnnotateConfig:
+    """A session of every automatic annotator, at a free port.
+
+    Args:
+        dataset: a candidate dataset.
+        votes: folder of all votes; by default inside the dataset.
+        seed: of the queues' order.
+        only: a list of candidates to discuss.
+    """
+    return AnnotateConfig(dataset, tuple(EYES), 0, votes, seed, only, examples=False)
 
 
 def annotate(config: AnnotateConfig, say: Callable[[str], None]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lerobot_roborecover.cli.progress import Progress
+from lerobot_roborecover.progress import Progress
 
 
 def test_each_thing_has_a_bar_that_ends_full(capsys):

@@ -1,0 +1,35 @@
+"""The arguments that LeRobot's parser reads."""
+
+import sys
+from dataclasses import dataclass
+
+import pytest
+
+from lerobot_roborecover.env.command_line import process_arguments, run_with_arguments
+
+pytestmark = pytest.mark.lerobot
+
+
+def test_the_process_has_its_own_arguments_back(monkeypatch):
+    held = ["program", "--one"]
+    monkeypatch.setattr(sys, "argv", held)
+    with process_arguments("roborecover-eval", ("--two=2", "--three")):
+        assert sys.argv == ["roborecover-eval", "--two=2", "--three"]
+    assert held == ["program", "--one"]
+    with pytest.raises(ZeroDivisionError), process_arguments("other", []):
+        1 / len(sys.argv[1:])
+    assert sys.argv is held, "who holds the list sees the same"
+    assert held == ["program", "--one"]
+
+
+def test_lerobots_parser_reads_them():
+    @dataclass
+    class Config:
+        steps: int = 1
+
+    def steps(config: Config) -> int:
+        return config.steps
+
+    before = sys.argv[:]
+    assert run_with_arguments(steps, "roborecover-eval", ["--steps=7"]) == 7
+    assert sys.argv == before
