@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Sets up what is missing, checks style (ruff), then runs the tests on two cores. Arguments go to pytest; --quick runs
-# what needs no simulator, no LeRobot and no browser, --nightly the whole sweeps, too.
+# Sets up what is missing, checks style (ruff), imports (import-linter) and types (ty), then runs the tests on two
+# cores. Arguments go to pytest; --quick runs what needs no simulator, no LeRobot and no browser, --nightly the whole
+# sweeps, too.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 scripts/setup.sh
@@ -12,6 +13,11 @@ scripts/setup.sh
 .venv/bin/lint-imports --no-cache >/dev/null || {
     .venv/bin/lint-imports --no-cache --no-logo >&2 || true
     echo "imports point one way (CONTRIBUTING.md; tool.importlinter in pyproject.toml)" >&2
+    exit 1
+}
+.venv/bin/ty check --quiet --python .venv lerobot_roborecover >/dev/null 2>&1 || {
+    .venv/bin/ty check --python .venv --output-format concise lerobot_roborecover >&2 || true
+    echo "types do not hold: .venv/bin/ty check lerobot_roborecover" >&2
     exit 1
 }
 # Simulators are single-threaded; a thread pool each only makes them fight for the cores.
