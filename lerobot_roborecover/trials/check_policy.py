@@ -47,6 +47,8 @@ from lerobot_roborecover.trials.load_problems import load_remedy
 from lerobot_roborecover.trials.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
 
+SHORT = {"--json": "--check.json=true"}
+"""What this command has and `lerobot-eval` does not, by its short name."""
 _RECORDED = 50
 """Scenarios whose prefixes are compared with the checkpoint's statistics, at most."""
 
@@ -390,6 +392,6 @@ def main(argv: Sequence[str]) -> int:
 
     init_logging()
     register_third_party_plugins()
-    long = ["--check.json=true" if a == "--json" else a for a in argv]
+    long = [SHORT.get(argument, argument) for argument in argv]
     program, *words = rewrite_env_argument(["roborecover-eval", *long])
     return run_with_arguments(check, program, words)
