@@ -62,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from lerobot_roborecover.curation import donors
+    from lerobot_roborecover.curation.attrition import StageCounts
     from lerobot_roborecover.curation.normalisation import use_statistics_of
     from lerobot_roborecover.curation.policy_trials import env_config, read_trials, run_trials
     from lerobot_roborecover.datasets import load_scenarios
@@ -79,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
     scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
     rows = [row for log in args.logs for row in read_trial_log(log)]
     base = policy_identity(args.base) if args.base not in {r.policy for r in rows} else args.base
-    funnel = donors.Funnel.begin(f"scenarios of split {args.split}", len(scenarios))
+    funnel: list[StageCounts] = []
+    donors.add_step(funnel, f"scenarios of split {args.split}", len(scenarios))
     candidates = donors.choose_candidates(scenarios, rows, base, options, funnel)
     trials = [t for folder in args.trials_from for t in read_trials(folder)]
     work = args.work or args.out.with_name(f"{args.out.name}.trials")
@@ -110,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     if args.statistics_of or Path(args.base).is_dir():
         use_statistics_of(args.out, Path(args.statistics_of or args.base))
     (args.out / FOLDER / MANIFEST_FILE).write_text(json.dumps(note, indent=1) + "\n")
-    print(funnel.table())
+    print(donors.funnel_table(funnel))
     print(
         f"\nlerobot-train --config_path=policies/train/correction_act.yaml --dataset.repo_id=local/donors "
         f"--dataset.root={args.out} --output_dir=correction"

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.curation.attrition import StageCounts
 from lerobot_roborecover.curation.monitor_data.frames import Film, Job, replayed
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
@@ -81,32 +82,22 @@ class Donor:
         return [t for t in self.trials if t.row.success]
 
 
-@dataclass
-class Funnel:
-    """How many were left after each step, and why the others were not."""
+def add_step(funnel: list[StageCounts], what: str, kept: int, dropped: Counter[str] | None = None) -> None:
+    """Adds a step to a funnel: what is left, and why the others are not.
 
-    steps: list[tuple[str, int, Counter]]
+    What is counted may change on the way, from scenarios to trajectories of them; nothing is undecided.
+    """
+    reasons = tuple((dropped or Counter()).most_common())
+    funnel.append(StageCounts(what, funnel[-1].kept if funnel else kept, kept, reasons, 0))
 
-    @classmethod
-    def begin(cls, what: str, count: int) -> Funnel:
-        """A funnel that starts with so many."""
-        return cls([(what, count, Counter())])
 
-    def add(self, what: str, count: int, dropped: Counter | None = None) -> None:
-        """A further step: what is left, and what was dropped on the way."""
-        self.steps.append((what, count, dropped or Counter()))
-
-    def table(self) -> str:
-        """In plain text."""
-        lines = []
-        for what, count, dropped in self.steps:
-            lines += [f"{'':8}- {n} {reason}" for reason, n in dropped.most_common()]
-            lines.append(f"{count:6}  {what}")
-        return "\n".join(lines)
-
-    def record(self) -> list[dict[str, Any]]:
-        """As JSON-able records."""
-        return [{"step": w, "count": n, "dropped": dict(d)} for w, n, d in self.steps]
+def funnel_table(funnel: Sequence[StageCounts]) -> str:
+    """How many were left after each step, in plain text."""
+    lines = []
+    for step in funnel:
+        lines += [f"{'':8}- {n} {reason}" for reason, n in step.dropped]
+        lines.append(f"{step.kept:6}  {step.stage}")
+    return "\n".join(lines)
 
 
 def choose_candidates(
@@ -114,7 +105,7 @@ def choose_candidates(
     rows: Iterable[TrialRow],
     base: str,
     options: DonorOptions,
-    funnel: Funnel,
+    funnel: list[StageCounts],
 ) -> list[Candidate]:
     """Scenarios and alternatives whose rates call for a donor.
 
@@ -157,13 +148,18 @@ def choose_candidates(
             if not able:
                 dropped[f"recovered by no alternative in more than {options.donor_above:.0%}"] += 1
             found += [Candidate(scenario, p, rates[base], rates[p]) for p in able]
-    funnel.add("scenarios with an alternative that does better", len({c.scenario.id for c in found}), dropped)
-    funnel.add("candidates: such a scenario and one alternative", len(found))
+    add_step(
+        funnel, "scenarios with an alternative that does better", len({c.scenario.id for c in found}), dropped
+    )
+    add_step(funnel, "candidates: such a scenario and one alternative", len(found))
     return found
 
 
 def judge(
-    candidates: Iterable[Candidate], trials: Iterable[PolicyTrial], options: DonorOptions, funnel: Funnel
+    candidates: Iterable[Candidate],
+    trials: Iterable[PolicyTrial],
+    options: DonorOptions,
+    funnel: list[StageCounts],
 ) -> list[Donor]:
     """Candidates whose trials are complete and mostly succeed.
 
@@ -192,7 +188,7 @@ def judge(
         else:
             donors.append(donor)
     what = f"donors: {options.successes} of {options.trials} trials succeed, all complete"
-    funnel.add(what, len(donors), dropped)
+    add_step(funnel, what, len(donors), dropped)
     return donors
 
 
@@ -202,7 +198,7 @@ def source_record(scenario: Scenario) -> str:
 
 
 def deduplicate(
-    donors: Iterable[Donor], options: DonorOptions, funnel: Funnel
+    donors: Iterable[Donor], options: DonorOptions, funnel: list[StageCounts]
 ) -> list[tuple[Donor, PolicyTrial]]:
     """At most `per_record` trajectories of each source record, none of them twice.
 
@@ -225,7 +221,7 @@ def deduplicate(
             if not taken:
                 dropped["of a source record that has its trajectory already"] += 1
             kept += [(donor, trial) for trial in taken]
-    funnel.add("trajectories", len(kept), dropped)
+    add_step(funnel, "trajectories", len(kept), dropped)
     return kept
 
 
@@ -240,7 +236,7 @@ def write_donors(
     *,
     simulator: Mapping[str, Any],
     workers: int,
-    funnel: Funnel,
+    funnel: list[StageCounts],
     description: str = "",
     license: str | None = None,
     on_trajectory: Callable[[int, int], None] = lambda done, total: None,
@@ -265,7 +261,8 @@ def write_donors(
 
     if not chosen:
         raise ScenarioError(
-            f"no trajectory is left for {root}:\n{funnel.table()}\nRun more alternatives, or more scenarios"
+            f"no trajectory is left for {root}:\n{funnel_table(funnel)}\nRun more alternatives, or more "
+            "scenarios"
         )
     dropped: Counter = Counter()
     platform = chosen[0][0].candidate.scenario.platform
@@ -287,7 +284,7 @@ def write_donors(
 
     write_trajectories(root, "donors", trajectories(), fps=fps, description=description, license=license)
     written = len(chosen) - dropped.total()
-    funnel.add("trajectories that succeed again when replayed", written, dropped)
+    add_step(funnel, "trajectories that succeed again when replayed", written, dropped)
     return written
 
 
@@ -327,6 +324,7 @@ def _trajectory(donor: Donor, trial: PolicyTrial, frames: list) -> Trajectory:
     )
 
 
-def describe(options: DonorOptions, base: str, funnel: Funnel) -> dict[str, Any]:
+def describe(options: DonorOptions, base: str, funnel: list[StageCounts]) -> dict[str, Any]:
     """What the dataset's `donors.json` says."""
-    return {"base": base, "options": asdict(options), "funnel": funnel.record()}
+    steps = [{"step": s.stage, "count": s.kept, "dropped": dict(s.dropped)} for s in funnel]
+    return {"base": base, "options": asdict(options), "funnel": steps}

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_roborecover.curation.attrition import StageCounts
 from lerobot_roborecover.curation.donors import (
     DonorOptions,
-    Funnel,
+    add_step,
     choose_candidates,
     deduplicate,
     judge,
@@ -72,8 +73,14 @@ def trial(scenario, policy, index, success=True, actions=None, **changes) -> Pol
     return PolicyTrial(row(scenario, policy, index, success, **values), actions)
 
 
-def reasons(funnel: Funnel) -> dict[str, int]:
-    return {reason: n for _, _, dropped in funnel.steps for reason, n in dropped.items()}
+def begun(what: str, count: int) -> list[StageCounts]:
+    funnel: list[StageCounts] = []
+    add_step(funnel, what, count)
+    return funnel
+
+
+def reasons(funnel: list[StageCounts]) -> dict[str, int]:
+    return {reason: n for step in funnel for reason, n in step.dropped}
 
 
 def test_candidates_are_the_papers():
@@ -90,7 +97,7 @@ def test_candidates_are_the_papers():
         *rows_of(f, BASE, 0), *rows_of(f, GOOD, 5),
         *[replace(r, start="initial") for r in rows_of(d, GOOD, 5)],
     ]  # fmt: skip
-    funnel = Funnel.begin("scenarios", 6)
+    funnel = begun("scenarios", 6)
     found = choose_candidates([a, b, c, d, e, f], rows, BASE, DonorOptions(), funnel)
     assert {(x.scenario.id, x.policy) for x in found} == {(a.id, GOOD), (c.id, GOOD), (c.id, FAIR)}
     assert reasons(funnel) == {
@@ -99,15 +106,15 @@ def test_candidates_are_the_papers():
         "without a trial of the base": 1,
         "of the test split, which must not train anything": 1,
     }
-    assert funnel.steps[-1][1] == 3
+    assert funnel[-1].kept == 3
     with pytest.raises(ScenarioError, match=r"no trial .* is by 'nobody'"):
-        choose_candidates([a], rows, "nobody", DonorOptions(), Funnel.begin("s", 1))
+        choose_candidates([a], rows, "nobody", DonorOptions(), begun("s", 1))
 
 
 def chosen_candidates(made, policies=(GOOD, FAIR)):
     rows = [r for s in made for r in rows_of(s, BASE, 0)]
     rows += [r for s in made for p in policies for r in rows_of(s, p, 5)]
-    return choose_candidates(made, rows, BASE, DonorOptions(), Funnel.begin("scenarios", len(made)))
+    return choose_candidates(made, rows, BASE, DonorOptions(), begun("scenarios", len(made)))
 
 
 def test_three_of_four_and_all_complete():
@@ -118,7 +125,7 @@ def test_three_of_four_and_all_complete():
     trials += [trial(b, GOOD, k, k < 2) for k in range(4)]
     trials += [trial(c, GOOD, k) for k in range(3)] + [trial(c, GOOD, 3, False, outcome="timeout")]
     trials += [trial(d, GOOD, k) for k in range(3)]
-    funnel = Funnel.begin("candidates", 4)
+    funnel = begun("candidates", 4)
     passed = judge(candidates, trials, DonorOptions(), funnel)
     assert [p.candidate.scenario.id for p in passed] == [a.id]
     assert reasons(funnel) == {
@@ -135,13 +142,13 @@ def test_one_trajectory_per_source_record_and_none_twice():
     trials = [trial(s, GOOD, k, k != 3) for s in made[:2] for k in range(4)]
     trials += [trial(s, FAIR, k) for s in made[:2] for k in range(4)]
     trials += [trial(made[2], GOOD, k, actions=same) for k in range(4)]
-    funnel = Funnel.begin("candidates", len(candidates))
+    funnel = begun("candidates", len(candidates))
     passed = judge(candidates, trials, DonorOptions(), funnel)
     one = deduplicate(passed, DonorOptions(), funnel)
     by_record = {d.candidate.scenario.cluster: (d.candidate.policy, t.row.trial) for d, t in one}
     assert by_record.keys() == {"rollout-0", "rollout-1"}
     assert by_record["rollout-0"][0] == FAIR, "four successes come before three"
-    many = deduplicate(passed, DonorOptions(per_record=3), Funnel.begin("", 0))
+    many = deduplicate(passed, DonorOptions(per_record=3), begun("", 0))
     hashes = [t.row.actions_sha256 for _, t in many]
     assert len(hashes) == len(set(hashes)) == 4, "three of one record; the other has one in four copies"
     assert all(t.row.success for _, t in many)
@@ -159,7 +166,7 @@ def test_written_checked_and_readable_by_lerobot(tmp_path):
     wrong = recovery(made[0])[:-1]  # one step short of success
     trials = [trial(made[0], GOOD, t.row.trial, actions=wrong) if t.row.scenario_id == made[0].id else t
               for t in trials]  # fmt: skip
-    funnel = Funnel.begin("scenarios", 6)
+    funnel = begun("scenarios", 6)
     passed = judge(candidates, trials, DonorOptions(), funnel)
     chosen = deduplicate(passed, DonorOptions(), funnel)
     assert len(chosen) == 3
