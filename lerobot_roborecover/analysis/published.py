@@ -86,11 +86,3 @@ def policies(platform: str | None = None) -> list[PublishedPolicy]:
 
 def _estimate(row: dict[str, str], name: str) -> Estimate:
     return Estimate(*(float(row[f"{name}{suffix}"]) / 100 for suffix in ("", "_lo", "_hi")))
-
-
-def cell_counts(platform: str) -> dict[str, int]:
-    """Scenarios of each cell of a platform's test set."""
-    return {
-        f"{row['stage']}-{row['deviation_type']}": int(row[f"{platform}_test"])
-        for row in table("stage_type_counts")
-    }

@@ -23,7 +23,7 @@ from lerobot_roborecover.analysis.groups import (
     source_matrix,
 )
 from lerobot_roborecover.analysis.logs import Arm
-from lerobot_roborecover.analysis.monitor import monitor_metrics
+from lerobot_roborecover.analysis.monitor import METRICS, metric_columns
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.ranking import rank_agreement
 from lerobot_roborecover.analysis.resampling import masked_mean, resample
@@ -352,15 +352,14 @@ def test_intervention_cost_by_hand():
 
 
 def test_monitor_metrics_by_hand():
-    found = monitor_metrics(tn=8, fp=2, fn=1, tp=9)
-    assert found.accuracy == 0.85
-    assert (found.precision, found.recall) == (9 / 11, 0.9)
-    assert found.f1 == pytest.approx(18 / 21)
-    assert found.macro_f1 == pytest.approx((18 / 21 + 16 / 19) / 2)
-    assert found.false_positive_rate == 0.2
-    assert math.isnan(monitor_metrics(0, 0, 1, 1).false_positive_rate)
-    with pytest.raises(ValueError, match="must not be negative"):
-        monitor_metrics(-1, 0, 0, 1)
+    counts = np.array([[8.0, 2.0, 1.0, 9.0], [0.0, 0.0, 1.0, 1.0]])  # TN, FP, FN, TP
+    found, none_before = (dict(zip(METRICS, row, strict=True)) for row in metric_columns(counts))
+    assert found["accuracy"] == 0.85
+    assert (found["precision"], found["recall"]) == (9 / 11, 0.9)
+    assert found["f1"] == pytest.approx(18 / 21)
+    assert found["macro_f1"] == pytest.approx((18 / 21 + 16 / 19) / 2)
+    assert found["false_positive_rate"] == 0.2
+    assert math.isnan(none_before["false_positive_rate"])
 
 
 @settings(max_examples=25, deadline=None)
