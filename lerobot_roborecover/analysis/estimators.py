@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import LEVEL, clean
 from lerobot_roborecover.analysis.units import Unit, default_unit, unit_labels
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Outcome
@@ -155,45 +154,6 @@ def invalid_counts(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     """Number of rows by invalid outcome; outcomes that do not occur are left out."""
     outcomes = Counter(row["outcome"] for row in rows)
     return {name: count for name, count in sorted(outcomes.items()) if not Outcome(name).valid}
-
-
-def bootstrap_interval(
-    rates: np.ndarray,
-    cells: Sequence[str] | None = None,
-    *,
-    clusters: Sequence[str] | None = None,
-    draws: int = DRAWS,
-    level: float = LEVEL,
-    rng: np.random.Generator | None = None,
-) -> tuple[float, float]:
-    """The paper's interval: percentile bootstrap of `rsr`, or of `macro` where cells are given.
-
-    It stays to be compared with the paper; what is printed as the interval is `intervals.py`'s, which covers.
-
-    A draw takes as many scenarios (or clusters) as there are, with replacement. In a draw that leaves a cell
-    empty, the macro rate is the mean over the others.
-
-    Args:
-        rates: (n,) in [0, 1].
-        cells: n labels; None for the interval of `rsr`.
-        clusters: n labels of the units to resample; None resamples scenarios.
-        draws: bootstrap draws (paper: 10,000).
-        level: confidence level.
-        rng: source of the draws; by default one seeded with 0, so that a table is reproducible.
-
-    Returns:
-        Lower and upper bound; NaN for fewer than two units, which say nothing about spread.
-    """
-    rates = np.asarray(rates, float)
-    units = np.arange(len(rates)) if clusters is None else np.unique(clusters, return_inverse=True)[1]
-    count = int(units.max()) + 1 if len(units) else 0
-    if count < 2:
-        return float("nan"), float("nan")
-    rng = rng or np.random.default_rng(0)
-    weights = draw_counts(rng, count, draws)[:, units]  # (draws, n)
-    values = weights @ rates / weights.sum(1) if cells is None else _macro_of_draws(rates, cells, weights)
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
-    return float(clean(low)), float(clean(high))
 
 
 def draw_counts(rng: np.random.Generator, units: int, draws: int) -> np.ndarray:

@@ -69,7 +69,7 @@ def macro_estimates(panel: Panel, resampling: Resampling) -> list[Estimate]:
 def percentile_macro(panel: Panel, resampling: Resampling) -> list[Estimate]:
     """The paper's percentile bootstrap of Macro RSR, to compare with the paper.
 
-    A draw that leaves a cell empty averages the others, as `estimators.bootstrap_interval` does.
+    A draw that leaves a cell empty averages the others.
     """
     labels, cells = panel.labels("cell"), panel.occupied("cell")
     member = np.stack([labels == cell for cell in cells])  # (C, N)

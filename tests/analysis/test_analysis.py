@@ -7,7 +7,6 @@ import pytest
 
 from lerobot_roborecover.analysis.estimators import (
     RowsError,
-    bootstrap_interval,
     invalid_counts,
     macro,
     rsr,
@@ -15,6 +14,7 @@ from lerobot_roborecover.analysis.estimators import (
 )
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.scenario import Start
+from tests.support.bootstrap import bootstrap_interval
 
 
 def row(scenario, trial, outcome="success", cell="Approach-Wrong Pose", start="recovery", **more):

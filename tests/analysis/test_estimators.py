@@ -14,7 +14,7 @@ from scipy import stats
 from lerobot_roborecover.analysis.contrasts import contrasts, contributions
 from lerobot_roborecover.analysis.costs import intervention_cost
 from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
-from lerobot_roborecover.analysis.estimators import RowsError, bootstrap_interval, macro, rsr, scenario_rates
+from lerobot_roborecover.analysis.estimators import RowsError, macro, rsr, scenario_rates
 from lerobot_roborecover.analysis.groups import (
     group_rates,
     macro_estimates,
@@ -31,6 +31,7 @@ from lerobot_roborecover.analysis.timing import budget_estimates, median_steps, 
 from lerobot_roborecover.analysis.variance import variance_split
 from lerobot_roborecover.env.trial_log import TrialLogError
 from lerobot_roborecover.scenario import Start
+from tests.support.bootstrap import bootstrap_interval
 from tests.support.trial_rows import policy_rows, trial_row
 
 
