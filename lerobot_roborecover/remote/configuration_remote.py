@@ -17,6 +17,8 @@ class RemoteConfig(PreTrainedConfig):
 
     url: str = "ws://127.0.0.1:8000"
     """Address of the server: `ws://HOST:PORT`, or `wss://` where a proxy adds TLS."""
+    protocol: str = ""
+    """`openpi` or `vla_eval`; empty: the mapping's."""
     mapping: str = ""
     """What the server is sent and what it answers: a packaged mapping (`lerobot`, for `roborecover serve`;
     `openpi_libero`; ...) or the path of a YAML file."""
@@ -43,6 +45,10 @@ class RemoteConfig(PreTrainedConfig):
         super().__post_init__()
         if not self.url.startswith(("ws://", "wss://")):
             raise RemoteError(f"--policy.url={self.url}: write ws://HOST:PORT")
+        if self.protocol not in ("", "openpi", "vla_eval"):
+            raise RemoteError(f"--policy.protocol={self.protocol}: not one of openpi, vla_eval")
+        if self.protocol == "vla_eval" and not self.mapping:
+            self.mapping = "vla_eval_libero"
         for name, low, high in (
             ("connections", 1, 256),
             ("timeout_s", 0.001, 10**5),

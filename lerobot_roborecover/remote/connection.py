@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from websockets.exceptions import (
     ConnectionClosed,
@@ -68,6 +68,15 @@ class Request:
     payload: dict[str, Any]
     prelude: dict[str, Any] | None = None
     """A message sent, and answered, just before it on the same connection."""
+    session: str = ""
+    """Whose trial this is, where a server keeps its state with the connection."""
+    step: int = 0
+    """Requests of the session before this one."""
+    instruction: str = ""
+    repeat: int = 1
+    """How often it is sent, for as many actions."""
+    end: bool = False
+    """Whether the session is over; the payload is not looked at."""
 
 
 class Connection:
@@ -137,19 +146,23 @@ class Connection:
 
     def _exchange(self, socket: ClientConnection, message: bytes) -> Any:
         socket.send(message)
+        answer = self._receive(socket)
+        if isinstance(answer, str):
+            if answer.startswith(_SESSION_LOST):
+                raise SessionGoneError(f"the server reports: {answer.removeprefix(_SESSION_LOST)[:500]}")
+            raise ServerRefusedError(f"the server reports an error: {_gist(answer)}")
+        return unpack(answer, "the server's answer")
+
+    def _receive(self, socket: ClientConnection) -> bytes | str:
+        """What the server says next."""
         try:
-            answer = socket.recv(timeout=self._options.timeout_s)
+            return socket.recv(timeout=self._options.timeout_s)
         except TimeoutError as err:
             self.close()
             raise ServerAwayError(
                 f"{self._options.url} gave no answer within {self._options.timeout_s:g} s "
                 "(--policy.timeout_s)"
             ) from err
-        if isinstance(answer, str):
-            if answer.startswith(_SESSION_LOST):
-                raise SessionGoneError(f"the server reports: {answer.removeprefix(_SESSION_LOST)[:500]}")
-            raise ServerRefusedError(f"the server reports an error: {_gist(answer)}")
-        return unpack(answer, "the server's answer")
 
     def open(self, budget_s: float) -> ClientConnection:
         """Connects, trying for a while, and reads the metadata.
@@ -167,7 +180,7 @@ class Connection:
                     options.url, compression=None, max_size=options.max_frame_bytes, ping_interval=None,
                     open_timeout=10, close_timeout=1, additional_headers=headers, proxy=None,
                 )  # fmt: skip
-                first = socket.recv(timeout=options.timeout_s)
+                first = self._first_words(socket)
                 break
             except InvalidURI as err:
                 raise RemoteError(f"--policy.url={options.url}: {err}; write ws://HOST:PORT") from err
@@ -191,15 +204,28 @@ class Connection:
                 if self._closing.wait(min(delay_s, left_s)):
                     raise ServerAwayError("closed") from err
                 delay_s = min(2 * delay_s, _LONGEST_DELAY_S)
+        self.metadata = self._introduced(socket, first)
+        return socket
+
+    def _first_words(self, socket: ClientConnection) -> bytes | str:
+        """What the server says of itself."""
+        return socket.recv(timeout=self._options.timeout_s)
+
+    def _introduced(self, socket: ClientConnection, first: bytes | str) -> dict[str, Any]:
+        """The server's metadata.
+
+        Args:
+            socket: the new connection.
+            first: of `_first_words`.
+        """
         if isinstance(first, str):
             raise ServerRefusedError(f"the server's first message is an error: {_gist(first)}")
         metadata = unpack(first, "the server's metadata")
         if not isinstance(metadata, dict):
             raise WireError(f"the server's metadata is a {type(metadata).__name__}, not a map")
-        self.metadata = metadata
-        if options.greeting is not None:
-            self._exchange(socket, pack(options.greeting))
-        return socket
+        if self._options.greeting is not None:
+            self._exchange(socket, pack(self._options.greeting))
+        return metadata
 
     def close(self) -> None:
         """Drops the connection; the next request opens another."""
@@ -215,12 +241,15 @@ class Server:
     options: ServerOptions
     metadata: dict[str, Any] = field(default_factory=dict)
     """The server's own, once it has been reached."""
+    connection_class: ClassVar[type[Connection]] = Connection
 
     def __post_init__(self):
         self._closing = threading.Event()
         self._answered = False
         self._idle: queue.LifoQueue[Connection] = queue.LifoQueue()
-        self._all = [Connection(self.options, self._closing) for _ in range(self.options.connections)]
+        self._all = [
+            self.connection_class(self.options, self._closing) for _ in range(self.options.connections)
+        ]
         for connection in self._all:
             self._idle.put(connection)
         self._threads = ThreadPoolExecutor(self.options.connections, thread_name_prefix="remote")

@@ -42,6 +42,8 @@ class ImageEntry:
     """`uint8` from 0 to 255, or `float32` from 0 to 1."""
     batch_axis: bool = False
     """Whether the server wants a first axis of length 1."""
+    when: tuple[str, ...] = ()
+    """Observation parameters that the server must have asked for: `name`, or `not name` (vla-eval)."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,9 @@ class StatePart:
     """Our key."""
     slice: tuple[int, int] | None = None
     """First index, and one past the last; None takes all."""
-    convert: Literal["none", "axis_angle_to_quat_xyzw"] = "none"
-    """Axis-angle keeps the sign of robosuite's quaternion (an angle from 0 to 2 pi), so that this inverts
-    LeRobot's conversion."""
+    convert: Literal["none", "axis_angle_to_quat_xyzw", "axis_angle_to_pi"] = "none"
+    """Axis-angle keeps the sign of robosuite's quaternion (an angle from 0 to 2 pi), so that the quaternion
+    inverts LeRobot's conversion; `axis_angle_to_pi` is the same rotation by at most pi."""
 
     def __post_init__(self):
         if self.slice is not None and not 0 <= self.slice[0] < self.slice[1]:
@@ -72,6 +74,8 @@ class StateEntry:
     under: str = ""
     dtype: Literal["float32", "float64"] = "float32"
     batch_axis: bool = False
+    when: tuple[str, ...] = ()
+    """As of a picture."""
 
     def __post_init__(self):
         if not self.parts:
@@ -167,6 +171,16 @@ class Reset:
 
 
 @dataclass(frozen=True)
+class Specs:
+    """What is given and taken, in the words of a server that declares its own (vla-eval's `DimSpec`)."""
+
+    action: dict[str, str] = field(default_factory=dict)
+    """Format by component."""
+    observation: dict[str, str] = field(default_factory=dict)
+    """Format by component."""
+
+
+@dataclass(frozen=True)
 class Mapping:
     """One server's interface."""
 
@@ -174,6 +188,12 @@ class Mapping:
     """Of this format."""
     about: str
     """What the mapping speaks to, in a line."""
+    protocol: Literal["openpi", "vla_eval"] = "openpi"
+    """How the server is spoken to."""
+    specs: Specs = field(default_factory=Specs)
+    """Compared with what the server declares (vla-eval)."""
+    episode: dict[str, Any] = field(default_factory=dict)
+    """Said of the task at every episode's start, beside its instruction (vla-eval)."""
     native: bool = False
     """Whether the server is `roborecover serve`: observations go under our own keys, each trial has its
     session, and the server draws its noise from the trial's seed."""
@@ -195,10 +215,12 @@ class Mapping:
             raise MappingError("native: true takes no images, state, window, reset or constants")
         if not self.native and not (self.images or self.state):
             raise MappingError("sends nothing: give images or state (or native: true for roborecover serve)")
-        keys = [(e.under, e.key) for e in (*self.images, *self.state)]
+        if self.protocol == "vla_eval" and (self.native or self.window or self.reset):
+            raise MappingError("protocol: vla_eval takes no native, window or reset")
+        keys = [(e.under, e.key, *e.when) for e in (*self.images, *self.state)]
         keys += [("", k) for k in self.constants]
         keys += [("", self.prompt.key)] + ([("", self.window.key)] if self.window else [])
-        twice = sorted({"/".join(filter(None, k)) for k in keys if keys.count(k) > 1})
+        twice = sorted({"/".join(filter(None, k[:2])) for k in keys if keys.count(k) > 1})
         if twice:
             raise MappingError(f"server keys given twice: {twice}")
 

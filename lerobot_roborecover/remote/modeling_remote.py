@@ -31,6 +31,7 @@ from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
 from lerobot_roborecover.remote.sessions import ENVELOPE, PROTOCOL
 from lerobot_roborecover.remote.translate import Translator
+from lerobot_roborecover.remote.vla_eval import EpisodeServer, check_specs, wanted
 
 if TYPE_CHECKING:
     from lerobot_roborecover.remote.host import RemoteHost
@@ -80,7 +81,13 @@ class RemotePolicy(PreTrainedPolicy):
         self.translator = Translator(mapping, config.n_action_steps, width)
         self.native = mapping.native
         self._reset_message = mapping.reset.message if mapping.reset else None
-        self.server = Server(
+        if config.protocol not in ("", mapping.protocol):
+            raise MappingError(
+                f"--policy.mapping={config.mapping} is for {mapping.protocol}; --policy.protocol="
+                f"{config.protocol} needs one of its own"
+            )
+        self._pinned = mapping.protocol == "vla_eval"
+        self.server = (EpisodeServer if self._pinned else Server)(
             ServerOptions(
                 config.url,
                 timeout_s=config.timeout_s,
@@ -89,7 +96,7 @@ class RemotePolicy(PreTrainedPolicy):
                 connections=config.connections,
                 max_frame_bytes=config.max_frame_mb * 2**20,
                 api_key=api_key(),
-                greeting=self._reset_message,
+                greeting=mapping.episode if self._pinned else self._reset_message,
             )
         )
         weakref.finalize(self, self.server.close)
@@ -101,6 +108,9 @@ class RemotePolicy(PreTrainedPolicy):
             metadata = self.server.reach()
             if self.native:
                 self._check_server(metadata)
+            if self._pinned:
+                check_specs(metadata, mapping.specs, width, config.url)
+                self.translator.flags = wanted(metadata)
         except RemoteError:
             self.server.close()
             raise
@@ -203,6 +213,9 @@ class RemotePolicy(PreTrainedPolicy):
         if self.native and slot.step:
             self.server.tell(Request({ENVELOPE: {"session": slot.session, "end": True}}))
             slot.step = 0
+        if self._pinned and slot.step:
+            self.server.tell(Request({}, session=slot.session, end=True))
+            slot.step = 0
 
     def advance(
         self, observations: Sequence[Mapping[str, np.ndarray]], tasks: Sequence[str], slots: Sequence[Slot]
@@ -252,7 +265,9 @@ class RemotePolicy(PreTrainedPolicy):
             payload = self.translator.request(slot.frames, task)
             if self.native:
                 payload[ENVELOPE] = {"session": slot.session, "seed": slot.seed, "step": slot.step}
-            requests.append(Request(payload, None if slot.step else self._reset_message))
+            prelude = None if slot.step else self._reset_message
+            repeat = (self.translator.execute or 1) if self._pinned else 1
+            requests.append(Request(payload, prelude, slot.session, slot.step, task, repeat))
         answers = self.server.ask(requests)
         self._count_outage(answers)
         return [self._actions(slot, answer) for slot, answer in zip(slots, answers, strict=True)]

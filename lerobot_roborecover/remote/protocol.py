@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 import msgpack
@@ -50,6 +51,21 @@ def unpack(data: bytes, what: str = "message") -> Any:
         WireError: the bytes are no msgpack, or hold an array that is not allowed or lies about its size, or
             more values than any request has.
     """
+    return unpack_bounded(data, what, "openpi's msgpack", _decode)
+
+
+def unpack_bounded(data: bytes, what: str, form: str, decode: Callable[[dict], Any]) -> Any:
+    """The message of some bytes that a stranger may have made.
+
+    Args:
+        data: a whole frame.
+        what: who sent it, for the error.
+        form: what the bytes should be, for the error.
+        decode: makes an array of a map that stands for one, and gives back any other.
+
+    Raises:
+        WireError: the bytes are no msgpack, hold more values than any message has, or `decode` raised.
+    """
     left = _MOST_VALUES
 
     def count(values: int) -> None:
@@ -60,7 +76,7 @@ def unpack(data: bytes, what: str = "message") -> Any:
 
     def map_read(content: dict) -> Any:
         count(2 * len(content) + 1)
-        return _decode(content)
+        return decode(content)
 
     def list_read(content: list) -> list:
         count(len(content) + 1)
@@ -73,7 +89,7 @@ def unpack(data: bytes, what: str = "message") -> Any:
         )  # fmt: skip
     except Exception as err:  # whatever a stranger's bytes make of it, it is their fault and no reason to end
         reason = str(err) or type(err).__name__
-        raise WireError(f"{what}: {len(data)} bytes that are not openpi's msgpack: {reason}") from err
+        raise WireError(f"{what}: {len(data)} bytes that are not {form}: {reason}") from err
 
 
 def _encode(value: Any) -> Any:
@@ -93,22 +109,39 @@ def _encode(value: Any) -> Any:
 
 def _decode(value: dict) -> Any:
     if b"__ndarray__" in value:
-        return _array(value)
+        return checked_array(value.get(b"dtype"), value.get(b"shape"), value.get(b"data"))
     if b"__npgeneric__" in value:
-        return _dtype(value).type(value.get(b"data"))
+        return checked_dtype(value.get(b"dtype")).type(value.get(b"data"))
     return value
 
 
-def _dtype(value: dict) -> np.dtype:
-    name = value.get(b"dtype")
+def checked_dtype(name: Any) -> np.dtype:
+    """A dtype of booleans, integers or floats.
+
+    Args:
+        name: as it came.
+
+    Raises:
+        ValueError: it is another one, or none.
+    """
     dtype = np.dtype(name) if isinstance(name, str) and _DTYPE.fullmatch(name) else None
     if dtype is None or dtype.kind not in _KINDS:
         raise ValueError(f"array of dtype {name!r:.60}; only booleans, integers and floats are taken")
     return dtype
 
 
-def _array(value: dict) -> np.ndarray:
-    dtype, data, shape = _dtype(value), value.get(b"data"), value.get(b"shape")
+def checked_array(name: Any, shape: Any, data: Any) -> np.ndarray:
+    """A read-only array.
+
+    Args:
+        name: of its dtype, as it came.
+        shape: its shape, as it came.
+        data: its bytes, as they came.
+
+    Raises:
+        ValueError: these are not an array.
+    """
+    dtype = checked_dtype(name)
     whole = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
     if not whole or len(shape) > _MAX_DIMENSIONS or not isinstance(data, bytes):
         raise ValueError(f"array of shape {shape!r:.100} with {type(data).__name__} data")

@@ -26,6 +26,8 @@ class Translator:
 
     def __init__(self, mapping: Mapping, execute: int | None = None, width: int | None = None):
         self.mapping = mapping
+        self.flags: frozenset[str] = frozenset()
+        """What the server asked for; entries that want something else are left out."""
         self._width = width
         self.execute = execute or mapping.actions.execute
 
@@ -47,9 +49,9 @@ class Translator:
         if self.mapping.native:
             return {key: _native(key, value) for key, value in observation.items()}
         out: dict[str, Any] = {}
-        for image in self.mapping.images:
+        for image in (i for i in self.mapping.images if holds(i.when, self.flags)):
             _put(out, image.under, image.key, _picture(image, observation))
-        for state in self.mapping.state:
+        for state in (s for s in self.mapping.state if holds(s.when, self.flags)):
             _put(out, state.under, state.key, _vector(state, observation))
         return out
 
@@ -176,6 +178,28 @@ def quat_xyzw(axis_angle: np.ndarray) -> np.ndarray:
     return np.append(vector / angle * np.sin(angle / 2), np.cos(angle / 2))
 
 
+def axis_angle_to_pi(axis_angle: np.ndarray) -> np.ndarray:
+    """(3,) float64: the same rotation by an angle of at most pi."""
+    vector = np.asarray(axis_angle, np.float64)
+    angle = float(np.linalg.norm(vector))
+    return vector * ((angle - 2 * np.pi) / angle) if angle > np.pi else vector
+
+
+def holds(conditions: Sequence[str], flags: frozenset[str]) -> bool:
+    """Whether all of `name` and `not name` hold.
+
+    Args:
+        conditions: of a mapping's `when`.
+        flags: names that are true.
+    """
+    return all((c.removeprefix("not ") in flags) is not c.startswith("not ") for c in conditions)
+
+
+_CONVERSIONS = {
+    "none": np.asarray, "axis_angle_to_quat_xyzw": quat_xyzw, "axis_angle_to_pi": axis_angle_to_pi
+}  # fmt: skip
+
+
 def _put(out: dict[str, Any], under: str, key: str, value: np.ndarray) -> None:
     (out.setdefault(under, {}) if under else out)[key] = value
 
@@ -225,7 +249,7 @@ def _vector(entry: StateEntry, observation: Map[str, np.ndarray]) -> np.ndarray:
                 f"{list(part.slice or ())} of it"
             )
         vector = vector[slice(*part.slice)] if part.slice is not None else vector
-        parts.append(quat_xyzw(vector) if part.convert == "axis_angle_to_quat_xyzw" else vector)
+        parts.append(_CONVERSIONS[part.convert](vector))
     whole = np.concatenate(parts).astype(entry.dtype)
     return whole[None] if entry.batch_axis else whole
 

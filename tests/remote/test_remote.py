@@ -150,6 +150,7 @@ def test_a_mapping_is_found_by_name_or_path(tmp_path):
         load_mapping("openpy")
     assert packaged_mappings() == [
         "being_h05", "cosmos_policy", "lerobot", "lingbot_vla", "openpi_libero", "unifolm_vla",
+        "vla_eval_libero",
     ]  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from lerobot_roborecover.remote.protocol import pack, unpack
 from tests.support.processes import PATIENCE_S
 
 OPENPI_CLIENT = "openpi-client==0.1.2"
+VLA_EVAL = "vla-eval==0.8.0"
 ROOT = Path(__file__).parents[2]
 
 
@@ -116,14 +117,22 @@ def openpi_client(tmp_path_factory) -> Any:
     installed without dependencies but `typing_extensions`, into a folder of this test session. What the
     environment has itself comes first.
     """
-    if importlib.util.find_spec("openpi_client") is None:
-        folder = tmp_path_factory.mktemp("openpi_client")
-        _install(folder)
+    return _installed("openpi_client", OPENPI_CLIENT, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def vla_eval(tmp_path_factory) -> Any:
+    """The real `vla_eval`, likewise: its harness asks for packages that its servers do without."""
+    return _installed("vla_eval", VLA_EVAL, tmp_path_factory)
+
+
+def _installed(module: str, requirement: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    if importlib.util.find_spec(module) is None:
+        folder = tmp_path_factory.mktemp(module)
+        _install(folder, module, requirement)
         sys.path.append(str(folder))
         importlib.invalidate_caches()
-    import openpi_client
-
-    return openpi_client
+    return importlib.import_module(module)
 
 
 def _uv() -> list[str] | None:
@@ -136,18 +145,18 @@ def _uv() -> list[str] | None:
     return None
 
 
-def _install(folder: Path) -> None:
-    target = ["--no-deps", "--quiet", "--target", str(folder), OPENPI_CLIENT, "typing_extensions"]
+def _install(folder: Path, module: str, requirement: str) -> None:
+    target = ["--no-deps", "--quiet", "--target", str(folder), requirement, "typing_extensions"]
     commands = [[sys.executable, "-m", "pip", "install", *target]]
     if uv := _uv():
         commands.insert(0, [*uv, "pip", "install", "--python", sys.executable, *target])
     reasons = []
     for command in commands:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode == 0 and (folder / "openpi_client").is_dir():
+        if done.returncode == 0 and (folder / module).is_dir():
             return
         reasons.append(done.stderr.strip()[-200:])
     pytest.skip(
-        f"{OPENPI_CLIENT} could not be installed ({'; '.join(reasons)}): run scripts/setup.sh, which finds "
+        f"{requirement} could not be installed ({'; '.join(reasons)}): run scripts/setup.sh, which finds "
         "or installs uv, and see that PyPI can be reached"
     )
