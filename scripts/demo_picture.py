@@ -1,6 +1,6 @@
 """Takes the picture of the demo's page that README shows.
 
-    python scripts/demo_picture.py outputs/demo/report.html docs/images/demo.png
+    python -m scripts.demo_picture outputs/demo/report.html docs/images/demo.png
 
 Needs Chromium (or $ROBORECOVER_CHROMIUM) and playwright: the top of the page and the first scenarios of its
 gallery, side by side.
@@ -15,7 +15,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from lerobot_roborecover.studio.automatic.browser import FLAGS, find_chromium
+from tests.support.browser import FLAGS, find_chromium
 
 _SIZE = {"width": 900, "height": 1100}
 

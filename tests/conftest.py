@@ -104,7 +104,7 @@ HEAVY = ("slow", "nightly", "lerobot", "libero", "metaworld", "robotwin", "ray",
 """Marks of what `--quick` leaves out."""
 
 
-PACKAGES = {"robotwin": ("sapien", "robotwin"), "ray": ("ray", "ray"), "browser": ("playwright", "automatic")}
+PACKAGES = {"robotwin": ("sapien", "robotwin"), "ray": ("ray", "ray"), "browser": ("playwright", "test")}
 """By mark: the package that it needs, and the extra that has it. Nothing is imported to find out."""
 
 

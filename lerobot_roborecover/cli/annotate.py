@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add(
         "--automatic", action="store_true",
-        help="no people: three programs apply written rules to what the page shows; their labels are "
+        help="no people: three programs apply written rules to the recorded steps; their labels are "
         "marked as automatic wherever they go",
     )  # fmt: skip
     add("--port", type=int, default=8731, help="on this machine alone; 0 takes a free one (%(default)s)")
@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serves the page until interrupted, or has programs annotate."""
     from lerobot_roborecover.curation.annotation.annotators import PREFIX, is_automatic
+    from lerobot_roborecover.curation.annotation.automatic import annotate
     from lerobot_roborecover.scenario import ScenarioError
     from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
-    from lerobot_roborecover.studio.automatic.run import annotate, session
 
     reserved = [name for name in args.annotators if is_automatic(name)]
     if reserved:
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         raise ScenarioError("name who annotates with --annotator NAME, or say --automatic")
     try:
         if args.automatic:
-            annotate(session(args.dataset, args.votes, args.seed, args.only), _say)
+            annotate(args.dataset, _say, votes=args.votes, only=args.only)
         else:
             config = AnnotateConfig(
                 dataset=args.dataset,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 HELP = (
@@ -41,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.config} cannot be built, and nothing was run:\n{listed}", file=sys.stderr)
         if not args.dry_run:
             return 2
-    chain = Chain(config, Work(_annotate), lambda line: print(line, flush=True))
+    chain = Chain(config, Work(), lambda line: print(line, flush=True))
     waiting = ""
     try:
         done = chain.build(args.first, args.until, args.dry_run)
@@ -57,9 +56,3 @@ def run(args: argparse.Namespace) -> int:
     if config.publish is None and not args.until:
         print("\n" + next_line(publish_next(chain.places.result), "to publish"))
     return 0
-
-
-def _annotate(candidates: Path, votes: Path, say: Callable[[str], None]) -> None:
-    from lerobot_roborecover.studio.automatic.run import annotate, session
-
-    annotate(session(candidates, votes), say)

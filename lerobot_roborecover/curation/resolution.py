@@ -22,7 +22,7 @@ from typing import Literal
 
 from lerobot_roborecover.curation.agreement import Agreement, agreement
 from lerobot_roborecover.curation.annotation.annotators import label_kind
-from lerobot_roborecover.curation.annotation.discussion import MAX_ROUNDS, Discussion
+from lerobot_roborecover.curation.annotation.discussion import MAX_ROUNDS, Discussion, read_discussion
 from lerobot_roborecover.curation.annotation.votes import Vote, ballot, read_votes
 from lerobot_roborecover.curation.attrition import (
     Decision,
@@ -178,6 +178,28 @@ def queued(candidates: CandidateSet) -> set[str]:
     decisions = read_decisions(candidates.root)
     dropped = {d.candidate for d in decisions} - standing(decisions, "collect")
     return {c.id for c in candidates.candidates} - dropped
+
+
+def to_vote_on(candidates: CandidateSet, only: Path | None) -> tuple[set[str], Discussion | None]:
+    """Candidates that annotators are asked about in a session, and the discussion that it is, if it is one.
+
+    Args:
+        candidates: the dataset.
+        only: a list of candidates to discuss (`roborecover agree --discuss`).
+
+    Raises:
+        ScenarioError: the list cannot be read or names others, or no candidate is left.
+    """
+    wanted = queued(candidates)
+    discussion = read_discussion(only) if only else None
+    if discussion is not None:
+        unknown = sorted(set(discussion.candidates) - wanted)
+        if unknown:
+            raise ScenarioError(f"{only} lists {unknown[0]!r:.80}, which is not in {candidates.root}")
+        wanted &= set(discussion.candidates)
+    if not wanted:
+        raise ScenarioError(f"{candidates.root} has no candidates left to look at")
+    return wanted, discussion
 
 
 def _check_vote(candidates: CandidateSet, name: str, vote: Vote) -> None:

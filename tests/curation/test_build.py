@@ -110,7 +110,7 @@ def test_the_example_can_be_read_and_tried(tmp_path, monkeypatch, capsys):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(OptionError, match=words):
             read_config(tmp_path / "bad.yaml")
-    chain = Chain(config, Work(lambda candidates, votes, say: None))
+    chain = Chain(config, Work())
     with pytest.raises(OptionError, match="--from nowhere: not one of"):
         chain.build("nowhere")
     with pytest.raises(OptionError, match="come in the order"):
@@ -244,7 +244,7 @@ def test_rollouts_of_which_nothing_is_kept_do_not_end_a_build(stand_in, monkeypa
     nothing = Collected(None, (), 0)
     monkeypatch.setattr("lerobot_roborecover.curation.collect.collection.collect", lambda *_: nothing)
     lines: list[str] = []
-    Work(lambda candidates, votes, say: None).collect(options, lines.append)
+    Work().collect(options, lines.append)
     assert "no rollout was kept" in lines[0]
 
 
@@ -280,7 +280,7 @@ def test_a_build_of_an_earlier_version_is_up_to_date(tmp_path):
     }  # fmt: skip
     config = read_config(write(tmp_path / "build.yaml", content))
     found, key = {}, ""
-    for stage in Chain(config, Work(lambda candidates, votes, say: None))._stages():
+    for stage in Chain(config, Work())._stages():
         key = _key(key, stage)
         found[stage.label] = key[:16]
     assert found == KEYS

@@ -178,7 +178,7 @@ def test_a_build_that_waits_names_a_command_that_is_accepted(tmp_path, monkeypat
         "screen": {"policies": [{"path": "p"}]}, "split": {"sizes": {"train": 0.5, "test": 0.5}},
     }  # fmt: skip
     lines: list[str] = []
-    work = Work(lambda candidates, votes, say: None)
+    work = Work()
     chain = Chain(read_config(write(tmp_path / "b.yaml", content)), work, lines.append)
     with pytest.raises(Waiting, match="1 candidate waits for votes") as caught:
         chain.build()

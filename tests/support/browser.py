@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +11,18 @@ from types import ModuleType
 
 import pytest
 
-from lerobot_roborecover.studio.automatic.browser import FLAGS, SLOW_MS, find_chromium
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+SLOW_MS = 120_000
+"""A busy machine is no failure."""
+
+
+def find_chromium() -> str | None:
+    """Path of the system's Chromium, or of `ROBORECOVER_CHROMIUM`; None where there is none."""
+    return os.environ.get("ROBORECOVER_CHROMIUM") or next(filter(None, map(shutil.which, _NAMES)), None)
 
 
 def chromium() -> str:
@@ -23,7 +36,7 @@ def chromium() -> str:
 def playwright_api() -> ModuleType:
     """Playwright; skips the test where it is not installed."""
     return pytest.importorskip(
-        "playwright.sync_api", reason="no Playwright: pip install 'lerobot_env_roborecover[automatic]'"
+        "playwright.sync_api", reason="no Playwright: pip install 'lerobot_env_roborecover[test]'"
     )
 
 

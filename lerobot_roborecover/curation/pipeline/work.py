@@ -15,6 +15,7 @@ from lerobot_roborecover.curation import publishing
 from lerobot_roborecover.curation import render as rendering
 from lerobot_roborecover.curation import split_dataset as splitting
 from lerobot_roborecover.curation.agree import AgreeRequest
+from lerobot_roborecover.curation.annotation import automatic
 from lerobot_roborecover.curation.collect import collection
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.publishing import PublishRequest
@@ -33,6 +34,11 @@ type Say = Callable[[str], None]
 def collect(options: CollectOptions, say: Say) -> None:
     """Rolls out, and says what was kept; that may be nothing."""
     say(collection.describe(collection.collect(options, _note)))
+
+
+def annotate(dataset: Path, votes: Path, say: Say) -> None:
+    """Has programs vote on the candidates of a dataset, into a folder."""
+    automatic.annotate(dataset, say, votes=votes)
 
 
 def agree(request: AgreeRequest, say: Say) -> None:
@@ -73,10 +79,8 @@ def _note(line: str) -> None:
 class Work:
     """The function of each stage; it returns once the stage's result is there."""
 
-    annotate: Callable[[Path, Path, Say], None]
-    """Has programs vote on the candidates of a dataset, into a folder. It belongs to the studio, which is
-    above this room, so it is given."""
     collect: Callable[[CollectOptions, Say], None] = collect
+    annotate: Callable[[Path, Path, Say], None] = annotate
     agree: Callable[[AgreeRequest, Say], None] = agree
     screen: Callable[[ScreenRequest, Say], None] = screen
     validate: Callable[[ValidationRequest, Say], None] = validate

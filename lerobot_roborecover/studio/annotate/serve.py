@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.curation.annotation.discussion import read_discussion
 from lerobot_roborecover.curation.annotation.examples import Examples
 from lerobot_roborecover.curation.annotation.frames import FrameStore, Videos
 from lerobot_roborecover.curation.annotation.votes import VoteBook, check_name, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
-from lerobot_roborecover.curation.resolution import queued
+from lerobot_roborecover.curation.resolution import to_vote_on
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.annotate.identity import names_of
 from lerobot_roborecover.studio.annotate.queue import queue_order
@@ -60,15 +59,7 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
         ) from None
     candidates = read_candidates(config.dataset)
     frames = FrameStore(Videos(config.dataset), [row.steps for row in candidates.trajectories.rows])
-    wanted = queued(candidates)
-    discussion = read_discussion(config.only) if config.only else None
-    if discussion is not None:
-        unknown = sorted(set(discussion.candidates) - wanted)
-        if unknown:
-            raise ScenarioError(f"{config.only} lists {unknown[0]!r:.80}, which is not in {config.dataset}")
-        wanted &= set(discussion.candidates)
-    if not wanted:
-        raise ScenarioError(f"{config.dataset} has no candidates left to look at")
+    wanted, discussion = to_vote_on(candidates, config.only)
     folder = votes_folder(config.dataset, config.votes)
     names = [check_name(name) for name in config.annotators]
     if len(set(names)) < len(names):

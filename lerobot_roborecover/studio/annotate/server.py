@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from starlette.applications import Starlette
@@ -27,11 +27,12 @@ from lerobot_roborecover.curation.annotation.examples import Examples
 from lerobot_roborecover.curation.annotation.frames import PACK, FrameStore
 from lerobot_roborecover.curation.annotation.guide import SLUGS, as_json
 from lerobot_roborecover.curation.annotation.naming import camera_labels
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, VoteError, parse_vote
+from lerobot_roborecover.curation.annotation.shown import take_vote
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, VoteError
 from lerobot_roborecover.curation.candidates import CandidateSet
-from lerobot_roborecover.scenario import ScenarioError, Source
+from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.annotate.identity import Names
-from lerobot_roborecover.studio.annotate.sheet import first_step, sheet, vote_json
+from lerobot_roborecover.studio.annotate.sheet import sheet, vote_json
 from lerobot_roborecover.studio.web.guard import Refusal, check_token, guarded, read_body, with_cookie
 from lerobot_roborecover.studio.web.page import PageFiles
 
@@ -197,17 +198,13 @@ class Handlers:
         sent = await read_body(request)
         self.check_dataset(sent)
         candidate = self.candidate(annotator, sent.get("candidate"))
-        number, candidates = self.study.candidates.by_id[candidate], self.study.candidates
+        marks = {k: v for k, v in sent.items() if k != "dataset"}
         try:
-            vote = parse_vote(
-                {k: v for k, v in sent.items() if k != "dataset"},
-                first_step=first_step(candidates, number),
-                steps=candidates.row(number).steps,
-                human=candidates.candidates[number].source is Source.HUMAN,
+            taken = await run_in_threadpool(
+                take_vote, annotator.book, self.study.candidates, candidate, marks
             )
         except VoteError as err:
             raise Refusal(422, str(err)) from None
-        taken = await run_in_threadpool(annotator.book.add, replace(vote, candidate=candidate))
         return JSONResponse({"vote": self._vote_json(taken)})
 
     async def undo(self, request: Request) -> Response:

@@ -1,23 +1,26 @@
-"""Automatic annotators: the rules on rollouts made by hand, and the whole way through the page."""
+"""Automatic annotators: the rules on rollouts made by hand, and votes on recorded ones."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.curation.annotation import automatic
 from lerobot_roborecover.curation.annotation.annotators import EYES, label_kind
+from lerobot_roborecover.curation.annotation.automatic import annotate, as_printed, reading, sheet_of
+from lerobot_roborecover.curation.annotation.discussion import Discussion
 from lerobot_roborecover.curation.annotation.looking import LOOK_S, Look, Sheet, frames_to_look_at
 from lerobot_roborecover.curation.annotation.rules import Verdict, judge
-from lerobot_roborecover.curation.annotation.votes import ballot, read_votes, votes_folder
+from lerobot_roborecover.curation.annotation.shown import shown
+from lerobot_roborecover.curation.annotation.votes import VoteBook, ballot, read_votes, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import ResolutionConfig, decisions_of, resolve, scenarios_of
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
-from lerobot_roborecover.studio.annotate.serve import AnnotateConfig
-from lerobot_roborecover.studio.automatic.run import annotate
-from tests.support.browser import chromium, playwright_api
-from tests.support.candidate_files import candidate_dataset
-from tests.support.processes import PATIENCE_S
+from tests.support.candidate_files import FPS as RECORDED_FPS
+from tests.support.candidate_files import STEPS, candidate_dataset, rollout
 
 FPS, LAST = 80, 200
 T = np.arange(LAST + 1)
@@ -173,31 +176,120 @@ def test_names_tell_people_from_programs(tmp_path, capsys):
     assert main(["annotate", str(tmp_path)]) == 2
     assert "--automatic" in capsys.readouterr().err
     with pytest.raises(ScenarioError, match="no automatic annotator 'ann'"):
-        annotate(AnnotateConfig(tmp_path, ["ann"]), print)
+        annotate(tmp_path, print, annotators=["ann"])
 
 
-@pytest.mark.browser
-@pytest.mark.nightly
-def test_three_programs_vote_through_the_page(tmp_path, monkeypatch, capsys):
-    chromium()
-    playwright_api()
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    root = candidate_dataset(tmp_path / "rollouts", 3)
-    said: list[str] = []
-    config = AnnotateConfig(root, ["auto-1"], port=0, examples=False)
-    annotate(config, said.append)
-    assert any("3 of 3" in line for line in said)
+@pytest.mark.parametrize(
+    ("value", "digits", "printed"),
+    [
+        (0.0625, 3, 0.063), (-0.0625, 3, -0.063), (0.1875, 3, 0.188), (0.0005, 3, 0.001), (1.0015, 3, 1.002),
+        (2.0, 3, 2.0), (1.005, 2, 1.0), (0.125, 2, 0.13), (44 / 80, 2, 0.55), (-0.0001, 3, 0.0),
+    ],
+)  # fmt: skip
+def test_numbers_are_rounded_as_the_page_prints_them(value, digits, printed):
+    """Expected: what `Number((value).toFixed(digits))` is in Chromium."""
+    assert as_printed(value, digits) == printed
+
+
+def test_what_is_read_of_a_frame_is_what_was_recorded(tmp_path):
+    candidates = read_candidates(candidate_dataset(tmp_path / "set", 5))
+    episode = shown(candidates, 4, RECORDED_FPS)
+    sheet = sheet_of("ep-0004", episode, RECORDED_FPS)
+    assert (sheet.last, sheet.human, sheet.solved) == (STEPS - 1, True, False)
+    # 44 frames at 20 Hz end at 2.20 s.
+    assert sheet.fps == pytest.approx(RECORDED_FPS)
+    assert sheet_of("x", replace(episode, steps=10), 80).fps == 9 / 0.11
+    assert sheet_of("x", replace(episode, steps=1), 80).fps == 1.0
+    _, steps = rollout(4)
+    eef, puck = steps.bodies["eef"][:, :3], steps.bodies["puck"][:, :3]
+    found = reading(episode, 12)
+    assert next(iter(found)) == "hand"
+    assert set(found["puck"]) - {"speed", "goal"} == {"reach", "moved", "height"}
+    speed = np.linalg.norm(eef[13] - eef[12]) * RECORDED_FPS
+    assert found["hand"]["speed"] == pytest.approx(speed, abs=6e-4)
+    assert found["puck"]["reach"] == pytest.approx(np.linalg.norm(eef[12] - puck[12]), abs=6e-4)
+    assert all(round(v, 3) == v for row in found.values() for v in row.values())
+
+
+def test_three_programs_vote_on_recorded_steps(tmp_path, capsys):
+    root = candidate_dataset(tmp_path / "rollouts", 25, dropped=(7,))
     assert main(["annotate", str(root), "--automatic"]) == 0
-    assert "auto-1: nothing to do" in capsys.readouterr().out
-    records = read_votes(votes_folder(root, None))
+    said = capsys.readouterr().out.splitlines()
+    for name in EYES:
+        mine = [line.removeprefix(f"{name}: ") for line in said if line.startswith(name)]
+        assert [line.split(",")[0] for line in mine[:2]] == ["20 of 24", "24 of 24"]
+        assert len(mine) == 3
+    assert main(["annotate", str(root), "--automatic"]) == 0
+    assert capsys.readouterr().out.splitlines() == [f"{name}: nothing to do" for name in EYES]
+    folder = votes_folder(root, None)
+    records, candidates = read_votes(folder), read_candidates(root)
     assert set(records) == set(EYES)
-    candidates = read_candidates(root)
     for name in EYES:
         given = ballot(records[name], 1).votes
-        assert set(given) == set(candidates.by_id)
-        assert all(0 <= v.seconds < PATIENCE_S for v in given.values())
-    found = resolve(candidates, votes_folder(root, None), ResolutionConfig())
+        assert set(given) == set(candidates.by_id) - {"ep-0007"}
+        assert all((v.annotator, v.informed, v.comment) == (name, False, "") for v in given.values())
+        assert len(records[name]) == len({r["uid"] for r in records[name]}) == 24
+    found = resolve(candidates, folder, ResolutionConfig())
     assert found.kind == "automatic"
     assert all(d.by.startswith("automatic votes of auto-1") for d in decisions_of(found, ResolutionConfig()))
-    for scenario in scenarios_of(candidates, found, ResolutionConfig()):
-        assert scenario.provenance["annotation"]["kind"] == "automatic"
+    scenarios = scenarios_of(candidates, found, ResolutionConfig())
+    assert scenarios
+    assert {s.provenance["annotation"]["kind"] for s in scenarios} == {"automatic"}
+
+
+def test_a_run_that_was_stopped_goes_on(tmp_path, monkeypatch, capsys):
+    root, folder = candidate_dataset(tmp_path / "rollouts", 5), tmp_path / "votes"
+    took = automatic.take_vote
+
+    def stopped(book, candidates, candidate, sent):
+        if candidate == "ep-0002":
+            raise KeyboardInterrupt
+        return took(book, candidates, candidate, sent)
+
+    monkeypatch.setattr(automatic, "take_vote", stopped)
+    assert main(["annotate", str(root), "--automatic", "--votes", str(folder)]) == 0
+    assert "stopped" in capsys.readouterr().out
+    monkeypatch.undo()
+    first = read_votes(folder)
+    assert [r["candidate"] for r in first["auto-1"]] == ["ep-0000", "ep-0001"]
+    assert main(["annotate", str(root), "--automatic", "--votes", str(folder)]) == 0
+    assert "auto-1: 3 of 3" in capsys.readouterr().out
+    then = read_votes(folder)
+    assert then["auto-1"][:2] == first["auto-1"]
+    assert all([r["candidate"] for r in then[n]] == [f"ep-{i:04d}" for i in range(5)] for n in EYES)
+
+
+def test_a_discussion_is_a_round_of_its_own(tmp_path):
+    root, listed = candidate_dataset(tmp_path / "rollouts", 3), tmp_path / "discuss.json"
+    annotate(root, print)
+    Discussion(2, {"ep-0001": {"why": "stage", "votes": []}}).write(listed)
+    annotate(root, print, only=listed)
+    for records in read_votes(votes_folder(root, None)).values():
+        assert [(r["candidate"], r["round"]) for r in records[3:]] == [("ep-0001", 2)]
+
+
+def test_no_point_is_before_the_first_step_at_which_one_may_be(tmp_path, monkeypatch):
+    root = candidate_dataset(tmp_path / "rollouts", 1)
+    early = Verdict(0, Stage.MOVE, DeviationType.WRONG_POSE)
+    monkeypatch.setattr(automatic, "verdict_on", lambda *_: early)
+    annotate(root, print, annotators=["auto-2"])
+    (vote,) = read_votes(votes_folder(root, None))["auto-2"]
+    # Two actions let the scene settle, and one was executed.
+    assert (vote["step"], vote["stage"], vote["deviation"]) == (3, "Move", "Wrong Pose")
+
+
+def test_what_cannot_be_voted_on_is_refused(tmp_path, monkeypatch):
+    root, listed = candidate_dataset(tmp_path / "rollouts", 2, dropped=(1,)), tmp_path / "discuss.json"
+    Discussion(2, {"ep-0001": {"why": "stage", "votes": []}}).write(listed)
+    with pytest.raises(ScenarioError, match="lists 'ep-0001', which is not in"):
+        annotate(root, print, only=listed)
+    book = VoteBook(votes_folder(root, None), "auto-1", 1)
+    with pytest.raises(ScenarioError, match="in use by another process"):
+        annotate(root, print)
+    book.close()
+    monkeypatch.setattr(automatic, "verdict_on", lambda *_: Verdict(discard="nothing known"))
+    with pytest.raises(ScenarioError, match=r"candidate ep-0000: the vote of auto-1 .*'nothing known'"):
+        annotate(root, print)
+    empty = candidate_dataset(tmp_path / "none", 1, dropped=(0,))
+    with pytest.raises(ScenarioError, match="no candidates left to look at"):
+        annotate(empty, print)
