@@ -1,4 +1,4 @@
-"""Work in a process of its own that says lines: a server at its address, a browser on its way."""
+"""Work in a process of its own that says lines, such as a server at its address."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LineProcess:
         context = multiprocessing.get_context("spawn")
         self._name = name
         self._lines, its = context.Pipe(duplex=False)
-        # Not a daemon: those may not start processes of their own, such as a browser.
+        # Not a daemon: those may not start processes of their own, such as simulators.
         self._process = context.Process(target=_work, args=(os.getpid(), its, work, arguments))
         self._process.start()
         its.close()

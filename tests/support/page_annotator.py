@@ -9,7 +9,7 @@ from typing import Any
 from lerobot_roborecover.curation.annotation.annotators import Eye
 from lerobot_roborecover.curation.annotation.automatic import verdict_on
 from lerobot_roborecover.curation.annotation.guide import STAGES, TYPES
-from lerobot_roborecover.curation.annotation.looking import Reading, Sheet
+from lerobot_roborecover.curation.annotation.looking import Look, Reading, Sheet
 from lerobot_roborecover.curation.annotation.rules import Verdict
 from lerobot_roborecover.curation.annotation.votes import DISCARD_REASONS
 
@@ -49,6 +49,8 @@ class PageAnnotator:
 
     def __init__(self, page: Any, eye: Eye):
         self._page, self._eye, self._at = page, eye, 0
+        self.looks: list[Look] = []
+        """What it has read, by episode; these go by the page's names."""
 
     def annotate_all(self) -> None:
         """Votes on all that has no vote; every vote is on disk when this returns."""
@@ -57,6 +59,7 @@ class PageAnnotator:
         said = self._page.evaluate(_SHEET)
         for _ in range(int(said["total"]) - int(said["done"])):
             sheet = self._opened(before)
+            self.looks.append(Look(sheet))
             self._enter(verdict_on(sheet, self._read, self._eye))
             before = sheet.candidate
         self._wait(_SAVED)
@@ -103,7 +106,8 @@ class PageAnnotator:
                 self._press(keys)
         self._at = frame
         self._wait(_AT, frame)
-        return self._page.evaluate(_READ)["rows"]
+        found = self.looks[-1].readings[frame] = self._page.evaluate(_READ)["rows"]
+        return found
 
     def _wait(self, wanted: str, *values: Any) -> None:
         self._page.wait_for_function(wanted, arg=list(values))

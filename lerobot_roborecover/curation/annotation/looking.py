@@ -1,4 +1,4 @@
-"""What an automatic annotator has read off the page: numbers at the frames that it went to."""
+"""What an automatic annotator has read: the numbers that the page prints at the frames that it went to."""
 
 from __future__ import annotations
 

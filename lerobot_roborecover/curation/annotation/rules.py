@@ -33,7 +33,7 @@ PAUSE_M_S, PAUSE_S = 0.04, 0.3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be entered on the page."""
+    """What is to be entered."""
 
     step: int | None = None
     stage: Stage | None = None
@@ -275,5 +275,5 @@ class _Seen:
 
 def _need(values: np.ndarray | None) -> np.ndarray:
     if values is None:
-        raise ValueError("the page shows no place of an object; is it of another version?")
+        raise ValueError("no place of an object is shown")
     return values
