@@ -17,6 +17,7 @@ from lerobot_roborecover.curation.annotation.rules import Verdict, judge
 from lerobot_roborecover.curation.annotation.shown import shown
 from lerobot_roborecover.curation.annotation.votes import VoteBook, ballot, read_votes, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.pipeline.work import Work
 from lerobot_roborecover.curation.resolution import ResolutionConfig, decisions_of, resolve, scenarios_of
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
 from tests.support.candidate_files import FPS as RECORDED_FPS
@@ -257,6 +258,14 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, monkeypatch, capsys):
     then = read_votes(folder)
     assert then["auto-1"][:2] == first["auto-1"]
     assert all([r["candidate"] for r in then[n]] == [f"ep-{i:04d}" for i in range(5)] for n in EYES)
+
+
+def test_a_build_has_them_vote_into_its_own_folder(tmp_path):
+    root, said = candidate_dataset(tmp_path / "rollouts", 1), []
+    Work().annotate(root, tmp_path / "votes", said.append)
+    assert set(read_votes(tmp_path / "votes")) == set(EYES)
+    assert len(said) == 2 * len(EYES)
+    assert not votes_folder(root, None).exists()
 
 
 def test_a_discussion_is_a_round_of_its_own(tmp_path):
