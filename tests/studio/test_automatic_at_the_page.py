@@ -3,6 +3,7 @@ recorded steps lead to."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from lerobot_roborecover.curation.annotation.annotators import EYES
 from lerobot_roborecover.curation.annotation.automatic import annotate, reading, sheet_of
 from lerobot_roborecover.curation.annotation.frames import Videos
 from lerobot_roborecover.curation.annotation.looking import Look
-from lerobot_roborecover.curation.annotation.shown import shown
+from lerobot_roborecover.curation.annotation.shown import Shown, shown
 from lerobot_roborecover.curation.annotation.votes import read_votes
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.studio.annotate.identity import names_of
@@ -19,7 +20,7 @@ from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
 from lerobot_roborecover.studio.line_process import LineProcess
 from tests.support.browser import browsing
 from tests.support.candidate_files import candidate_dataset
-from tests.support.page_annotator import PageAnnotator
+from tests.support.page_annotator import READ, PageAnnotator
 
 pytestmark = pytest.mark.browser
 
@@ -71,6 +72,30 @@ def compare(root: Path, tmp_path: Path, names: list[str]) -> None:
 def test_the_page_shows_what_the_steps_say(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     compare(candidate_dataset(tmp_path / "rollouts", 5), tmp_path, ["auto-1"])
+
+
+def test_every_row_of_the_readout_is_read(tmp_path, monkeypatch):
+    """Grippers, goals and speeds of objects, which the toy has not; and numbers in the middle of two."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    whole = {"reach": [0.0625], "goal": [0.1875], "moved": [1.0015], "height": [-0.0625]}
+    episode = Shown(
+        "do it", 1, 1, False, False, {"x": [0.5]}, {"gripper": [-1.0], "left gripper": [0.0005]}, [0.3125],
+        {"black bowl 1": [0.0015]}, {"black bowl 1": whole, "plate": {**whole, "goal": None}},
+    )  # fmt: skip
+    config = AnnotateConfig(candidate_dataset(tmp_path / "set", 1), ["auto-1"], port=0, examples=False)
+    with LineProcess("the annotation server", serve, config) as server, browsing() as visit:
+        page, _ = visit((server.hear() or "").split()[-1])
+        page.wait_for_selector("#cameras canvas[data-episode]", state="attached")
+        page.evaluate(
+            """async (episode) => {
+                const { Readout } = await import("./readout.js");
+                const readout = new Readout(document.querySelector("#readout"));
+                readout.show(episode, () => "red");
+                readout.at(0);
+            }""",
+            asdict(episode),
+        )
+        assert page.evaluate(READ)["rows"] == reading(episode, 0)
 
 
 @pytest.mark.nightly

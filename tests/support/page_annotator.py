@@ -13,12 +13,13 @@ from lerobot_roborecover.curation.annotation.looking import Look, Reading, Sheet
 from lerobot_roborecover.curation.annotation.rules import Verdict
 from lerobot_roborecover.curation.annotation.votes import DISCARD_REASONS
 
-_READ = """() => {
+READ = """() => {
   const readout = document.querySelector("#readout"), rows = {};
   for (const o of readout.querySelectorAll("output"))
     (rows[o.dataset.of] ??= {})[o.dataset.value] = Number(o.textContent);
   return { step: Number(readout.dataset.step), rows };
 }"""
+"""The readout's numbers, by row and value."""
 _SHEET = """() => ({
   id: document.body.dataset.episode, instruction: document.querySelector("#instruction").textContent,
   about: document.querySelector("#about").textContent, frame: document.querySelector("#frame").textContent,
@@ -106,7 +107,7 @@ class PageAnnotator:
                 self._press(keys)
         self._at = frame
         self._wait(_AT, frame)
-        found = self.looks[-1].readings[frame] = self._page.evaluate(_READ)["rows"]
+        found = self.looks[-1].readings[frame] = self._page.evaluate(READ)["rows"]
         return found
 
     def _wait(self, wanted: str, *values: Any) -> None:
