@@ -4,4 +4,5 @@
 set -euo pipefail
 root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 "$root/scripts/setup.sh"
+unset PYTHONDONTWRITEBYTECODE # every simulator's process would compile this package again
 PATH="$root/.venv/bin:$PATH" exec "$root/.venv/bin/roborecover" demo "$@"

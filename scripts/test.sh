@@ -20,6 +20,8 @@ scripts/setup.sh
     echo "types do not hold: .venv/bin/ty check lerobot_roborecover" >&2
     exit 1
 }
+# Several hundred processes start: none of them is to compile this package again.
+unset PYTHONDONTWRITEBYTECODE
 # Simulators are single-threaded; a thread pool each only makes them fight for the cores.
 export MUJOCO_GL="${MUJOCO_GL:-egl}" OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
 # SAPIEN renders in software where scripts/setup.sh could get a driver for it.
