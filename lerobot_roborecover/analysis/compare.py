@@ -20,8 +20,8 @@ from lerobot_roborecover.analysis.results import Options, Results, analyse
 from lerobot_roborecover.analysis.runs import MethodContrast, MethodRate
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.tables import NOT_DEFINED, Column, Table, cell_text, to_text
-from lerobot_roborecover.analysis.units import ESTIMAND, Unit
-from lerobot_roborecover.analysis.verdicts import Verdict, method_text, verdict_text
+from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict, method_text, verdict_text
 
 _BAR_WIDTH = 41
 
@@ -38,7 +38,7 @@ class Comparison:
     rsr: tuple[Estimate, Estimate]
     contrast: Contrast
     """A minus B, with p adjusted for the family of the question."""
-    decision: Verdict
+    decision: ComparisonVerdict
     """What may be said of the two."""
     tasks: Estimate | None
     """The difference with its interval for other tasks like these; None where tasks are resampled anyhow."""
@@ -163,9 +163,11 @@ def _pair_panel(results: Results, a: str, b: str) -> Panel:
 
 def _tasks(results: Results, panel: Panel) -> Estimate | None:
     """The difference with its interval for other tasks; None where tasks are the units anyhow."""
-    if panel.unit(results.options.cluster) is Unit.TASK:
+    if panel.unit(results.options.cluster) is ResamplingUnit.TASK:
         return None
-    return results.resample(panel, Unit.TASK).differences((panel.rates[0] - panel.rates[1])[:, None])[0]
+    return results.resample(panel, ResamplingUnit.TASK).differences(
+        (panel.rates[0] - panel.rates[1])[:, None]
+    )[0]
 
 
 def _methods(results: Results, a: str, b: str) -> tuple[tuple[MethodRate, MethodRate], MethodContrast] | None:

@@ -12,7 +12,7 @@ from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.permutation import differing, sign_flip_p
 from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.verdicts import Verdict, verdict
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict, verdict
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Contrast:
     """Whether p and interval hold although the run was watched, and stopped when it was decided."""
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> ComparisonVerdict:
         """What may be said of the two."""
         return verdict(self)
 

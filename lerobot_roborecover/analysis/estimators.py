@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.units import Unit, default_unit, unit_labels
+from lerobot_roborecover.analysis.units import ResamplingUnit, default_unit, unit_labels
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Outcome
 
@@ -61,7 +61,7 @@ class ScenarioRates:
 
 
 def scenario_rates(
-    rows: Sequence[Mapping[str, Any]], scheduled: int | None = None, unit: Unit | None = None
+    rows: Sequence[Mapping[str, Any]], scheduled: int | None = None, unit: ResamplingUnit | None = None
 ) -> ScenarioRates:
     """Success rate of every scenario that has a row.
 
@@ -104,7 +104,9 @@ def scenario_rates(
     )
 
 
-def _units(ids: Sequence[str], groups: list[list[Mapping[str, Any]]], unit: Unit | None) -> tuple[str, ...]:
+def _units(
+    ids: Sequence[str], groups: list[list[Mapping[str, Any]]], unit: ResamplingUnit | None
+) -> tuple[str, ...]:
     platforms = sorted({str(r.get("platform", "")) for g in groups for r in g})
     if len(platforms) > 1:
         raise RowsError(

@@ -40,7 +40,7 @@ class PolicyMarks:
 
 
 @dataclass(frozen=True)
-class Clip:
+class TrialVideo:
     """A video of one trial."""
 
     policy: str
@@ -62,7 +62,7 @@ class Card:
     frame: str
     """Data URI of the recovery frame; empty where there is none."""
     marks: tuple[PolicyMarks, ...]
-    clips: tuple[Clip, ...]
+    clips: tuple[TrialVideo, ...]
     outcome_classes: tuple[str, ...]
     disagreement: float
     """Standard deviation of the policies' rates, in [0, 0.5]."""
@@ -73,7 +73,7 @@ class Card:
 def make_cards(
     panel: Panel,
     frames: Mapping[str, bytes],
-    clips: Mapping[str, Sequence[Clip]],
+    clips: Mapping[str, Sequence[TrialVideo]],
     initial: Panel | None = None,
 ) -> list[Card]:
     """Cards of all scenarios, those on which policies disagree most first.
@@ -197,7 +197,7 @@ def check_scenarios(study: Study, scenarios: Sequence[Scenario], name: str) -> l
 
 def find_clips(
     folders: Sequence[tuple[str, Path]], ids: Sequence[str], limit_bytes: int
-) -> tuple[dict[str, list[Clip]], list[str]]:
+) -> tuple[dict[str, list[TrialVideo]], list[str]]:
     """Videos as `lerobot-eval` names them: `<group>_<scenario id>/eval_episode_0.mp4`, the first of each.
 
     Args:
@@ -211,7 +211,7 @@ def find_clips(
     Raises:
         RowsError: a folder does not exist.
     """
-    clips: dict[str, list[Clip]] = {}
+    clips: dict[str, list[TrialVideo]] = {}
     used = skipped = 0
     for name, folder in folders:
         if not folder.is_dir():
@@ -228,7 +228,7 @@ def find_clips(
                 continue
             used += size
             data = base64.b64encode(found[0].read_bytes()).decode()
-            clips.setdefault(scenario_id, []).append(Clip(name, f"data:video/mp4;base64,{data}"))
+            clips.setdefault(scenario_id, []).append(TrialVideo(name, f"data:video/mp4;base64,{data}"))
     if skipped:
         return clips, [f"{skipped} video(s) are left out: all together exceed {limit_bytes // 2**20} MiB"]
     return clips, []

@@ -10,7 +10,7 @@ from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.words import counted
 
 
@@ -82,8 +82,8 @@ def _who(results: Results) -> str:
 
 def _standing(best: str, found: list[Contrast]) -> str:
     """From whom the first is separated, and from whom not."""
-    few = [c.b for c in found if c.verdict is Verdict.TOO_FEW]
-    level = [c.b for c in found if not c.verdict.separated and c.verdict is not Verdict.TOO_FEW]
+    few = [c.b for c in found if c.verdict is ComparisonVerdict.TOO_FEW]
+    level = [c.b for c in found if not c.verdict.separated and c.verdict is not ComparisonVerdict.TOO_FEW]
     if not few and not level:
         others = "the other policy" if len(found) == 1 else f"all {len(found)} other policies"
         return f"It is separated from {others}."

@@ -29,7 +29,7 @@ from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.units import WORDS
-from lerobot_roborecover.analysis.verdicts import Verdict
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, read_trial_log
 from lerobot_roborecover.scenario import Start
 
@@ -65,7 +65,7 @@ class Entry:
     initial: Estimate
     behind: Estimate
     """Best complete entry of the board minus this one, on common scenarios."""
-    verdict: Verdict | None
+    verdict: ComparisonVerdict | None
     """Of the best against this one, by Holm's p within the board; None for the best itself and for what is
     not ranked."""
     place: tuple[int, int] | None
@@ -303,7 +303,7 @@ def _board(
     )
 
 
-def _of_the_best(contrast: Contrast, best_is_a: bool) -> Verdict:
+def _of_the_best(contrast: Contrast, best_is_a: bool) -> ComparisonVerdict:
     return contrast.verdict if best_is_a else contrast.turned().verdict
 
 
@@ -313,7 +313,7 @@ def _place(p: int, ranked: list[int], between: dict[tuple[int, int], Contrast]) 
     above = below = 0
     for (a, b), contrast in between.items():
         if p in (a, b) and contrast.verdict.separated:
-            ahead = (contrast.verdict is Verdict.A_BETTER) == (p == a)
+            ahead = (contrast.verdict is ComparisonVerdict.A_BETTER) == (p == a)
             above, below = above + (not ahead), below + ahead
     return 1 + above, len(ranked) - below
 

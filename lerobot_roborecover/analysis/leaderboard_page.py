@@ -9,7 +9,7 @@ from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard, as_json, ranks, separated
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.tables import Column, Table
-from lerobot_roborecover.analysis.verdicts import Verdict
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.whole import write_whole
 
 
@@ -81,7 +81,11 @@ def _standing(entry: Entry, rank: str) -> str:
         return "best"
     if separated(entry):
         return "behind the best"
-    return "no verdict: too few differ" if entry.verdict is Verdict.TOO_FEW else "not separated from it"
+    return (
+        "no verdict: too few differ"
+        if entry.verdict is ComparisonVerdict.TOO_FEW
+        else "not separated from it"
+    )
 
 
 def published_table(platform: str) -> Table | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import Arm
-from lerobot_roborecover.analysis.units import Unit, default_unit, unit_labels
+from lerobot_roborecover.analysis.units import ResamplingUnit, default_unit, unit_labels
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage
 
@@ -78,11 +78,11 @@ class Panel:
         """(N,) str: one label of every scenario, by the name of its field."""
         return np.array([getattr(s, name) for s in self.scenarios], dtype=str)
 
-    def unit(self, asked: Unit | None = None) -> Unit:
+    def unit(self, asked: ResamplingUnit | None = None) -> ResamplingUnit:
         """What is taken as independent: what was asked for, by default what the paper resamples."""
         return asked or default_unit(self.scenarios[0].platform)
 
-    def units(self, asked: Unit | None = None) -> np.ndarray:
+    def units(self, asked: ResamplingUnit | None = None) -> np.ndarray:
         """(N,) str: scenarios with the same label are one unit."""
         return unit_labels(
             self.unit(asked),

@@ -13,7 +13,7 @@ from typing import Any
 from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis.escape import markdown, markdown_alt
 from lerobot_roborecover.analysis.figures import all_figures
-from lerobot_roborecover.analysis.gallery import OUTCOME_CLASSES, SIGNS, Card, Clip, make_cards
+from lerobot_roborecover.analysis.gallery import OUTCOME_CLASSES, SIGNS, Card, TrialVideo, make_cards
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.page import grouped, picture, render_page
@@ -63,7 +63,7 @@ class Extras:
 
     frames: Mapping[str, bytes] = field(default_factory=dict)
     """Recovery frames, PNG or JPEG, by scenario id."""
-    clips: Mapping[str, Sequence[Clip]] = field(default_factory=dict)
+    clips: Mapping[str, Sequence[TrialVideo]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     title: str = "Recovery report"
     introduction: tuple[str, ...] = ()

@@ -24,14 +24,17 @@ from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
 from lerobot_roborecover.analysis.timing import FRACTIONS, budget_estimates, median_steps
 from lerobot_roborecover.analysis.trial_metrics import trial_metrics
-from lerobot_roborecover.analysis.units import ESTIMAND, Unit
+from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.variance import variance_split
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, Verdict
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.scenario import Outcome
 
 _NAN = float("nan")
 _NOBODY = Estimate(_NAN, _NAN, _NAN)
-_VERDICTS = {v: v.value for v in Verdict} | {Verdict.A_BETTER: "helps", Verdict.B_BETTER: "harms"}
+_VERDICTS = {v: v.value for v in ComparisonVerdict} | {
+    ComparisonVerdict.A_BETTER: "helps",
+    ComparisonVerdict.B_BETTER: "harms",
+}
 """Of an intervention against direct control."""
 
 
@@ -111,7 +114,7 @@ def _of_tasks(results: Results) -> str:
     tasks = results.tasks
     if tasks is None:
         return ""
-    return f"Tasks like these: the same over the {tasks.units} tasks, for {ESTIMAND[Unit.TASK]}. "
+    return f"Tasks like these: the same over the {tasks.units} tasks, for {ESTIMAND[ResamplingUnit.TASK]}. "
 
 
 def initial_estimates(results: Results, *, as_in_the_paper: bool = False) -> list[Estimate]:
@@ -191,7 +194,7 @@ def _task_differences(results: Results) -> list[Estimate]:
     found = []
     for c in results.contrasts:
         own = results.ranked if {c.a, c.b} <= set(results.ranked.arms) else panel
-        draws = results.resample(own, Unit.TASK)
+        draws = results.resample(own, ResamplingUnit.TASK)
         values = own.rates[own.arm(c.a)] - own.rates[own.arm(c.b)]
         found += draws.differences(values[:, None])
     return found

@@ -26,7 +26,7 @@ from lerobot_roborecover.analysis.runs import (
     run_rates,
 )
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
-from lerobot_roborecover.analysis.units import WORDS, Unit
+from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
 
@@ -44,7 +44,7 @@ class Options:
     """Direct control that interventions are compared with; by default the same policy, or the only one."""
     interventions: tuple[str, ...] = ()
     """Policies to treat as interventions although none of their trials shows one."""
-    cluster: Unit | None = None
+    cluster: ResamplingUnit | None = None
     """What intervals and tests take as independent; by default what the paper resamples on the platform."""
     common: bool = False
     """Rank all policies, on the scenarios common to all; by default those that are complete."""
@@ -56,8 +56,8 @@ class Options:
             raise RowsError(
                 f"--draws={self.draws} bootstrap draws cannot give an interval; take at least 100"
             )
-        if self.cluster is not None and self.cluster not in list(Unit):
-            raise RowsError(f"--cluster={self.cluster} is not one of {', '.join(Unit)}")
+        if self.cluster is not None and self.cluster not in list(ResamplingUnit):
+            raise RowsError(f"--cluster={self.cluster} is not one of {', '.join(ResamplingUnit)}")
         if not 0.5 <= self.level < 1:
             raise RowsError(f"--level={self.level} is not a confidence level from 0.5 to 1")
         if self.scheduled is not None and self.scheduled < 1:
@@ -85,7 +85,7 @@ class Results:
         """Of the recovery panel's scenarios; shared by every number of the report on them."""
         return self.resample(self.recovery)
 
-    def resample(self, panel: Panel, unit: Unit | None = None) -> Resampling:
+    def resample(self, panel: Panel, unit: ResamplingUnit | None = None) -> Resampling:
         """Units of another panel's scenarios, with the same draws, seed and level."""
         o = self.options
         return resample(panel.units(unit or o.cluster), o.draws, o.seed, o.level)
@@ -137,9 +137,9 @@ class Results:
     def tasks(self) -> Resampling | None:
         """The recovery panel's scenarios by task, for what holds of other tasks; None where units are
         tasks."""
-        if self.recovery.unit(self.options.cluster) is Unit.TASK:
+        if self.recovery.unit(self.options.cluster) is ResamplingUnit.TASK:
             return None
-        return self.resample(self.recovery, Unit.TASK)
+        return self.resample(self.recovery, ResamplingUnit.TASK)
 
     @cached_property
     def contrasts(self) -> tuple[Contrast, ...]:

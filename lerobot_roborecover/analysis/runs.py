@@ -37,7 +37,7 @@ from lerobot_roborecover.analysis.intervals import (
 from lerobot_roborecover.analysis.logs import Arm
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, Verdict, method_verdict
+from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, ComparisonVerdict, method_verdict
 
 CAUTION = 2.0
 """Most degrees of freedom of an interval for each that the runs have: a variance between two or three runs
@@ -73,7 +73,7 @@ class MethodContrast:
     """Adjusted for all pairs of complete methods with enough runs; NaN for others."""
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> ComparisonVerdict:
         """What may be said of the two methods."""
         return method_verdict(self)
 

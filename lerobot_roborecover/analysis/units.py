@@ -15,7 +15,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 
 
-class Unit(StrEnum):
+class ResamplingUnit(StrEnum):
     """What an interval takes as independent."""
 
     SCENARIO = "scenario"
@@ -24,26 +24,32 @@ class Unit(StrEnum):
     TASK = "task"
 
 
-WORDS = {Unit.SCENARIO: "scenarios", Unit.TRAJECTORY: "trajectory clusters", Unit.TASK: "tasks"}
+WORDS = {
+    ResamplingUnit.SCENARIO: "scenarios",
+    ResamplingUnit.TRAJECTORY: "trajectory clusters",
+    ResamplingUnit.TASK: "tasks",
+}
 """What is resampled, in the plural."""
 ESTIMAND = {
-    Unit.SCENARIO: "other scenarios like these, of these tasks",
-    Unit.TRAJECTORY: "scenarios of other trajectories like these, of these tasks",
-    Unit.TASK: "scenarios of other tasks like these",
+    ResamplingUnit.SCENARIO: "other scenarios like these, of these tasks",
+    ResamplingUnit.TRAJECTORY: "scenarios of other trajectories like these, of these tasks",
+    ResamplingUnit.TASK: "scenarios of other tasks like these",
 }
 """What the intervals speak of."""
 
 
-def default_unit(platform: str) -> Unit:
+def default_unit(platform: str) -> ResamplingUnit:
     """What is resampled on a platform where nobody says otherwise (paper, appendix "Statistical analysis"):
     trajectory clusters where several scenarios come of one trajectory, else scenarios."""
     try:
-        return Unit.TRAJECTORY if platform_named(platform).clustered else Unit.SCENARIO
+        return ResamplingUnit.TRAJECTORY if platform_named(platform).clustered else ResamplingUnit.SCENARIO
     except ScenarioError:  # logs are read on machines that do not have their platform
-        return Unit.SCENARIO
+        return ResamplingUnit.SCENARIO
 
 
-def unit_labels(unit: Unit, ids: Sequence[str], clusters: Sequence[str], tasks: Sequence[str]) -> np.ndarray:
+def unit_labels(
+    unit: ResamplingUnit, ids: Sequence[str], clusters: Sequence[str], tasks: Sequence[str]
+) -> np.ndarray:
     """(N,) str: scenarios with the same label are one unit.
 
     Args:
@@ -52,9 +58,9 @@ def unit_labels(unit: Unit, ids: Sequence[str], clusters: Sequence[str], tasks: 
         clusters: N trajectory clusters; empty where a scenario has none.
         tasks: N tasks, told apart across suites.
     """
-    if unit is Unit.TASK:
+    if unit is ResamplingUnit.TASK:
         return np.array([f"task:{t}" for t in tasks], dtype=str)
-    if unit is Unit.TRAJECTORY:
+    if unit is ResamplingUnit.TRAJECTORY:
         named = [f"cluster:{c}" if c else f"scenario:{i}" for i, c in zip(ids, clusters, strict=True)]
         return np.array(named, dtype=str)
     return np.array([f"scenario:{i}" for i in ids], dtype=str)

@@ -18,7 +18,7 @@ LEAST_RUNS = 4
 above all of the other, an exact test of runs gives 2 / C(6, 3) = 0.1."""
 
 
-class Verdict(StrEnum):
+class ComparisonVerdict(StrEnum):
     """What the evidence says of policies A and B."""
 
     A_BETTER = "A is better"
@@ -34,34 +34,34 @@ class Verdict(StrEnum):
     @property
     def separated(self) -> bool:
         """Whether one of the two is better."""
-        return self in (Verdict.A_BETTER, Verdict.B_BETTER)
+        return self in (ComparisonVerdict.A_BETTER, ComparisonVerdict.B_BETTER)
 
 
-def verdict(contrast: Contrast) -> Verdict:
+def verdict(contrast: Contrast) -> ComparisonVerdict:
     """The rule: complete, at least six units differ, and Holm's p within the family is below 1 - level."""
     if not contrast.complete:
-        return Verdict.INCOMPLETE
+        return ComparisonVerdict.INCOMPLETE
     if contrast.differing < LEAST_DIFFERING:
-        return Verdict.TOO_FEW
+        return ComparisonVerdict.TOO_FEW
     if math.isnan(contrast.p_holm) or contrast.p_holm >= 1 - contrast.level:
-        return Verdict.NOT_SEPARATED
-    return Verdict.A_BETTER if contrast.difference.value > 0 else Verdict.B_BETTER
+        return ComparisonVerdict.NOT_SEPARATED
+    return ComparisonVerdict.A_BETTER if contrast.difference.value > 0 else ComparisonVerdict.B_BETTER
 
 
-def method_verdict(contrast: MethodContrast) -> Verdict:
+def method_verdict(contrast: MethodContrast) -> ComparisonVerdict:
     """The rule for the methods behind several runs: the runs at hand are separated, each method has at least
     four, and Holm's p for other runs like these is below 1 - level, too."""
     runs = verdict(contrast.these_runs)
-    if runs is Verdict.INCOMPLETE or contrast.these_runs.sequential:
-        return Verdict.INCOMPLETE
+    if runs is ComparisonVerdict.INCOMPLETE or contrast.these_runs.sequential:
+        return ComparisonVerdict.INCOMPLETE
     if min(contrast.runs) < LEAST_RUNS:
-        return Verdict.TOO_FEW_RUNS
+        return ComparisonVerdict.TOO_FEW_RUNS
     if not runs.separated:
         return runs
     if math.isnan(contrast.p_holm) or contrast.p_holm >= 1 - contrast.these_runs.level:
-        return Verdict.NOT_SEPARATED
-    same = (contrast.difference.value > 0) == (runs is Verdict.A_BETTER)
-    return runs if same else Verdict.NOT_SEPARATED
+        return ComparisonVerdict.NOT_SEPARATED
+    same = (contrast.difference.value > 0) == (runs is ComparisonVerdict.A_BETTER)
+    return runs if same else ComparisonVerdict.NOT_SEPARATED
 
 
 def method_text(contrast: MethodContrast) -> str:
@@ -72,7 +72,7 @@ def method_text(contrast: MethodContrast) -> str:
     )
     if found.separated:
         return f"Of the methods: {c.a if d.value > 0 else c.b} is better{bounds}."
-    if found is Verdict.TOO_FEW_RUNS:
+    if found is ComparisonVerdict.TOO_FEW_RUNS:
         have = " and ".join(f"{name} has {n}" for name, n in zip((c.a, c.b), contrast.runs, strict=True))
         return (
             f"Of the methods nothing is said, only of these runs: {have}, and it takes {LEAST_RUNS} runs of "
@@ -89,14 +89,14 @@ def verdict_text(contrast: Contrast) -> str:
     units = contrast.unit
     if found.separated:
         return f"{ahead} is better, by {points}."
-    if found is Verdict.INCOMPLETE:
+    if found is ComparisonVerdict.INCOMPLETE:
         return (
             "No verdict: one of the two was not run on all the scenarios of the comparison, and what it "
             f"lacks may be no accident. On the {contrast.scenarios} that both were run on, "
             + (f"{ahead} is ahead by {points}. " if d else "neither is ahead. ")
             + "Evaluate the rest, or ask for the common scenarios with --common."
         )
-    if found is Verdict.TOO_FEW:
+    if found is ComparisonVerdict.TOO_FEW:
         return (
             f"No verdict: the two differ on {contrast.differing} of {contrast.units} {units}, and below "
             f"{LEAST_DIFFERING} no test can tell chance from skill. Evaluate on more scenarios."

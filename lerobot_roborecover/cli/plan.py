@@ -131,7 +131,7 @@ def _guess(args: argparse.Namespace):
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.panel import make_panel
     from lerobot_roborecover.analysis.power import Guess, guess_from
-    from lerobot_roborecover.analysis.units import Unit
+    from lerobot_roborecover.analysis.units import ResamplingUnit
     from lerobot_roborecover.scenario import Start
 
     rate = None if args.rate is None else args.rate / 100
@@ -153,7 +153,7 @@ def _guess(args: argparse.Namespace):
     if args.sd is not None:
         guess = Guess(guess.rate, args.sd / 100, guess.correlation)
     remarks = list(study.remarks)
-    if panel.unit() is not Unit.SCENARIO:
+    if panel.unit() is not ResamplingUnit.SCENARIO:
         remarks.append(
             f"{study.platform} resamples {panel.unit().value} clusters: read clusters for scenarios"
         )

@@ -66,7 +66,7 @@ def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
 def analysis_options(args: argparse.Namespace):
     """`Options` from the arguments above and those that a command has of the rest."""
     from lerobot_roborecover.analysis.results import Options
-    from lerobot_roborecover.analysis.units import Unit
+    from lerobot_roborecover.analysis.units import ResamplingUnit
 
     return Options(
         args.draws,
@@ -75,7 +75,7 @@ def analysis_options(args: argparse.Namespace):
         args.trials,
         getattr(args, "baseline", None),
         tuple(getattr(args, "intervention", ())),
-        Unit(args.cluster) if args.cluster else None,
+        ResamplingUnit(args.cluster) if args.cluster else None,
         getattr(args, "common", False),
     )
 

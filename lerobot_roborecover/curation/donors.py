@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.attrition import StageCounts
-from lerobot_roborecover.curation.monitor_data.frames import Film, Job, replayed
+from lerobot_roborecover.curation.monitor_data.frames import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.env.trial_log import TrialRow
@@ -57,7 +57,7 @@ class DonorOptions:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class DonorCandidate:
     """An alternative on a scenario that the base does badly on."""
 
     scenario: Scenario
@@ -72,7 +72,7 @@ class Candidate:
 class Donor:
     """A candidate that passed its four trials."""
 
-    candidate: Candidate
+    candidate: DonorCandidate
     trials: tuple[PolicyTrial, ...]
     """All of them, by index."""
 
@@ -106,7 +106,7 @@ def choose_candidates(
     base: str,
     options: DonorOptions,
     funnel: list[StageCounts],
-) -> list[Candidate]:
+) -> list[DonorCandidate]:
     """Scenarios and alternatives whose rates call for a donor.
 
     Args:
@@ -134,7 +134,7 @@ def choose_candidates(
             "them with --base"
         )
     dropped: Counter = Counter()
-    found: list[Candidate] = []
+    found: list[DonorCandidate] = []
     for sha, scenario in by_hash.items():
         rates = {policy: float(np.mean(done)) for policy, done in results[sha].items()}
         if scenario.split == "test":
@@ -147,7 +147,7 @@ def choose_candidates(
             able = [p for p in sorted(rates) if p != base and rates[p] > options.donor_above]
             if not able:
                 dropped[f"recovered by no alternative in more than {options.donor_above:.0%}"] += 1
-            found += [Candidate(scenario, p, rates[base], rates[p]) for p in able]
+            found += [DonorCandidate(scenario, p, rates[base], rates[p]) for p in able]
     add_step(
         funnel, "scenarios with an alternative that does better", len({c.scenario.id for c in found}), dropped
     )
@@ -156,7 +156,7 @@ def choose_candidates(
 
 
 def judge(
-    candidates: Iterable[Candidate],
+    candidates: Iterable[DonorCandidate],
     trials: Iterable[PolicyTrial],
     options: DonorOptions,
     funnel: list[StageCounts],
@@ -288,12 +288,12 @@ def write_donors(
     return written
 
 
-def _job(donor: Donor, trial: PolicyTrial) -> Job:
+def _job(donor: Donor, trial: PolicyTrial) -> RenderJob:
     t = len(donor.candidate.scenario.prefix)
-    return Job(donor.candidate.scenario, trial.actions, np.arange(t, t + len(trial.actions)))
+    return RenderJob(donor.candidate.scenario, trial.actions, np.arange(t, t + len(trial.actions)))
 
 
-def _problem(film: Film, trial: PolicyTrial) -> str:
+def _problem(film: RenderedSteps, trial: PolicyTrial) -> str:
     if not film.succeeded:
         return "whose replay does not succeed"
     if len(film.observations) != len(trial.actions):

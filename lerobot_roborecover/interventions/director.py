@@ -34,7 +34,7 @@ type Observation = Mapping[str, torch.Tensor]
 
 
 @dataclass(eq=False)
-class Episode:
+class DirectedTrial:
     """One trial, as the composite policy sees it."""
 
     seed: int | None
@@ -81,22 +81,25 @@ class Director:
         self._rollback = BY_RULE if rewind_steps is None else rewind_steps
         self._width = self.members[Controller.BASE].action_width
 
-    def start(self, seed: int | None) -> Episode:
+    def start(self, seed: int | None) -> DirectedTrial:
         """A trial, with the base policy in charge.
 
         Args:
             seed: the trial's; None where the run has none, or where torch's own generator is seeded for it.
         """
-        episode = Episode(seed, pending=self._mode != "direct")
+        episode = DirectedTrial(seed, pending=self._mode != "direct")
         episode.history = self.members[Controller.BASE].start(seed)
         return episode
 
-    def finish(self, episode: Episode) -> None:
+    def finish(self, episode: DirectedTrial) -> None:
         """Gives back what a trial held."""
         self._leave(episode)
 
     def act(
-        self, observations: Sequence[Observation], instructions: Sequence[str], episodes: Sequence[Episode]
+        self,
+        observations: Sequence[Observation],
+        instructions: Sequence[str],
+        episodes: Sequence[DirectedTrial],
     ) -> list[Chunk | PolicyError]:
         """Actions with directives for slots that have none left to execute.
 
@@ -140,7 +143,7 @@ class Director:
         self,
         observations: Sequence[Observation],
         instructions: Sequence[str],
-        episodes: Sequence[Episode],
+        episodes: Sequence[DirectedTrial],
         out: list[Chunk | PolicyError | None],
     ) -> None:
         pending = [i for i, e in enumerate(episodes) if e.pending]
@@ -169,7 +172,7 @@ class Director:
             if fires[i]:
                 out[i] = self._intervene(episodes[i], instructions[i])
 
-    def _intervene(self, episode: Episode, instruction: str) -> Chunk | None:
+    def _intervene(self, episode: DirectedTrial, instruction: str) -> Chunk | None:
         """Hands the slot over; the rollback itself, where that is what it takes."""
         episode.pending = False
         told = episode.first
@@ -189,7 +192,7 @@ class Director:
 
     # --- who
 
-    def _leave(self, episode: Episode) -> None:
+    def _leave(self, episode: DirectedTrial) -> None:
         if episode.history is None:
             return
         if episode.controller is Controller.HUMAN:
@@ -199,7 +202,7 @@ class Director:
             self.members[episode.controller].finish(episode.history)
         episode.history = None
 
-    def _hand_over(self, episode: Episode, controller: Controller) -> None:
+    def _hand_over(self, episode: DirectedTrial, controller: Controller) -> None:
         """Fresh history and an empty queue for whoever takes over; the trial's random stream goes on."""
         self._leave(episode)
         episode.controller, episode.queue = controller, None
@@ -213,7 +216,7 @@ class Director:
         return self._driver
 
     def _driven(
-        self, observation: Observation, instruction: str, episode: Episode
+        self, observation: Observation, instruction: str, episode: DirectedTrial
     ) -> Chunk | PolicyError | None:
         """The person's next action; None where they have handed the slot back."""
         alone = {k: v[0] if isinstance(v, torch.Tensor) else v for k, v in observation.items()}
@@ -229,7 +232,7 @@ class Director:
             return PolicyError(f"the driver gave {action.dtype} {action.shape}, not floats ({self._width},)")
         return action[None]
 
-    def _next(self, episode: Episode) -> Chunk:
+    def _next(self, episode: DirectedTrial) -> Chunk:
         """What is executed before the slot is asked about again."""
         queue = episode.queue
         assert queue is not None

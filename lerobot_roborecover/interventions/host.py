@@ -11,7 +11,7 @@ from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.env.directives import WIDTH
-from lerobot_roborecover.interventions.director import Director, Episode
+from lerobot_roborecover.interventions.director import DirectedTrial, Director
 from lerobot_roborecover.policies.host import Chunk, PolicyError, Processor
 
 _NOISE = ("per_trial", "per_batch", "unseeded")
@@ -56,11 +56,11 @@ class InterventionHost:
         """How noise is drawn: as by the member that does worst."""
         return max((m.noise(seed) for m in self._director.members.values()), key=_NOISE.index)
 
-    def start(self, seed: int | None) -> Episode:
+    def start(self, seed: int | None) -> DirectedTrial:
         """A trial of that seed."""
         return self._director.start(seed)
 
-    def finish(self, history: Episode) -> None:
+    def finish(self, history: DirectedTrial) -> None:
         """Gives back what a trial held."""
         self._director.finish(history)
 
@@ -68,7 +68,7 @@ class InterventionHost:
         self,
         observations: Sequence[Mapping[str, Any]],
         instructions: Sequence[str],
-        histories: Sequence[Episode],
+        histories: Sequence[DirectedTrial],
     ) -> list[Chunk | PolicyError]:
         """One chunk with directives per waiting slot."""
         prepared: list[dict[str, torch.Tensor] | PolicyError] = []

@@ -19,7 +19,7 @@ from lerobot_roborecover.interventions.configuration_intervention import (
     MonitorConfig,
     RoboRecoverInterventionConfig,
 )
-from lerobot_roborecover.interventions.director import Director, Episode
+from lerobot_roborecover.interventions.director import DirectedTrial, Director
 from lerobot_roborecover.interventions.driver import load_driver
 from lerobot_roborecover.interventions.host import InterventionHost, tensors
 from lerobot_roborecover.interventions.members import MemberHost, load_member
@@ -63,7 +63,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
             correction_steps=config.correction_steps,
             rewind_steps=config.rewind_steps,
         )
-        self._episodes: list[Episode] = []
+        self._episodes: list[DirectedTrial] = []
         self._rows: list[list[np.ndarray]] = []
 
     @property

@@ -63,7 +63,7 @@ class SimulatorSetup:
     """Use snapshots also where what follows them drifts from a replay."""
 
 
-class Filmed:
+class FilmedEnvConfig:
     """A platform's env config, as far as recovery evaluation decides it where the env type is registered."""
 
     videos: bool

@@ -11,13 +11,13 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import Filmed, SimulatorSetup, first_camera, no_video
+from lerobot_roborecover.platforms.base import FilmedEnvConfig, SimulatorSetup, first_camera, no_video
 
 OBS_TYPES = ("state", "pixels_agent_pos")
 
 
 @dataclass
-class PlainConfig(EnvConfig, Filmed):
+class PlainConfig(EnvConfig, FilmedEnvConfig):
     """State vectors, and one square picture where asked for. A platform subclasses it and says how wide."""
 
     action_width: ClassVar[int]

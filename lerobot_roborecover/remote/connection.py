@@ -235,7 +235,7 @@ class Connection:
 
 
 @dataclass
-class Server:
+class RemoteServer:
     """A server as several connections see it: `ask` sends requests in parallel."""
 
     options: ServerOptions

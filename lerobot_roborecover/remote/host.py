@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.policies.host import Chunk, PolicyAwayError, PolicyError, Processor
 from lerobot_roborecover.remote.errors import RemoteError, ServerAwayError, SessionGoneError
-from lerobot_roborecover.remote.modeling_remote import RemotePolicy, Slot, split
+from lerobot_roborecover.remote.modeling_remote import RemotePolicy, RemoteTrial, split
 
 
 class RemoteHost:
@@ -46,11 +46,11 @@ class RemoteHost:
         drawn = self._policy.server.metadata.get("noise") if self._policy.native else None
         return drawn if seed is not None and drawn in ("per_trial", "per_batch") else "unseeded"
 
-    def start(self, seed: int | None) -> Slot:
+    def start(self, seed: int | None) -> RemoteTrial:
         """A fresh trial."""
         return self._policy.open_slot(seed)
 
-    def finish(self, history: Slot) -> None:
+    def finish(self, history: RemoteTrial) -> None:
         """Ends a trial on the server."""
         self._policy.close_slot(history)
 
@@ -58,7 +58,7 @@ class RemoteHost:
         self,
         observations: Sequence[Mapping[str, Any]],
         instructions: Sequence[str],
-        histories: Sequence[Slot],
+        histories: Sequence[RemoteTrial],
     ) -> list[Chunk | PolicyError]:
         """One chunk per waiting slot; single steps where the server wants the steps before.
 

@@ -164,7 +164,7 @@ class ActionEntry:
 
 
 @dataclass(frozen=True)
-class Reset:
+class ResetMessage:
     """What a server with a history must be told before a trial's first request, and after a reconnection."""
 
     message: dict[str, Any]
@@ -205,7 +205,7 @@ class Mapping:
     constants: dict[str, Any] = field(default_factory=dict)
     """Sent as they are with every request."""
     window: Window | None = None
-    reset: Reset | None = None
+    reset: ResetMessage | None = None
     actions: ActionEntry = field(default_factory=ActionEntry)
 
     def __post_init__(self):

@@ -1,8 +1,8 @@
 """The `remote` policy type: action chunks from a server that speaks openpi's protocol.
 
 A request is made per slot, and the requests of a batch travel at once. Each slot keeps what it needs of its
-trial in a `Slot`: actions not executed yet, the observations of the mapping's window, and the session under
-which a `roborecover serve` at the other end keeps the trial's history and noise.
+trial in a `RemoteTrial`: actions not executed yet, the observations of the mapping's window, and the session
+under which a `roborecover serve` at the other end keeps the trial's history and noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from lerobot_roborecover.policies.host import Processor
 from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-from lerobot_roborecover.remote.connection import Request, Server, ServerOptions
+from lerobot_roborecover.remote.connection import RemoteServer, Request, ServerOptions
 from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError, SessionGoneError
 from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
-class Slot:
+class RemoteTrial:
     """One trial, as the client sees it."""
 
     session: str
@@ -87,7 +87,7 @@ class RemotePolicy(PreTrainedPolicy):
                 f"{config.protocol} needs one of its own"
             )
         self._pinned = mapping.protocol == "vla_eval"
-        self.server = (EpisodeServer if self._pinned else Server)(
+        self.server = (EpisodeServer if self._pinned else RemoteServer)(
             ServerOptions(
                 config.url,
                 timeout_s=config.timeout_s,
@@ -101,7 +101,7 @@ class RemotePolicy(PreTrainedPolicy):
         )
         weakref.finalize(self, self.server.close)
         self._client, self._numbers = uuid.uuid4().hex, count()
-        self._slots: list[Slot] | None = None
+        self._slots: list[RemoteTrial] | None = None
         self._outages = 0
         self._checked = False
         try:
@@ -200,15 +200,15 @@ class RemotePolicy(PreTrainedPolicy):
 
     # --- trials
 
-    def open_slot(self, seed: int | None) -> Slot:
+    def open_slot(self, seed: int | None) -> RemoteTrial:
         """A fresh trial.
 
         Args:
             seed: of its noise; None draws what the server draws.
         """
-        return Slot(f"{self._client}-{next(self._numbers)}", seed)
+        return RemoteTrial(f"{self._client}-{next(self._numbers)}", seed)
 
-    def close_slot(self, slot: Slot) -> None:
+    def close_slot(self, slot: RemoteTrial) -> None:
         """Ends a trial: a `roborecover serve` forgets its history."""
         if self.native and slot.step:
             self.server.tell(Request({ENVELOPE: {"session": slot.session, "end": True}}))
@@ -218,7 +218,10 @@ class RemotePolicy(PreTrainedPolicy):
             slot.step = 0
 
     def advance(
-        self, observations: Sequence[Mapping[str, np.ndarray]], tasks: Sequence[str], slots: Sequence[Slot]
+        self,
+        observations: Sequence[Mapping[str, np.ndarray]],
+        tasks: Sequence[str],
+        slots: Sequence[RemoteTrial],
     ) -> list[np.ndarray | RemoteError]:
         """One (A,) action per slot; the server is asked for those that have none left."""
         if self.translator.frames > 1:
@@ -236,7 +239,10 @@ class RemotePolicy(PreTrainedPolicy):
         return [s.problem if s.problem is not None else s.actions.popleft() for s in slots]
 
     def ask(
-        self, observations: Sequence[Mapping[str, np.ndarray]], tasks: Sequence[str], slots: Sequence[Slot]
+        self,
+        observations: Sequence[Mapping[str, np.ndarray]],
+        tasks: Sequence[str],
+        slots: Sequence[RemoteTrial],
     ) -> list[np.ndarray | RemoteError]:
         """An (n, A) chunk per slot, to be executed whole.
 
@@ -254,7 +260,7 @@ class RemotePolicy(PreTrainedPolicy):
     def _answers(
         self,
         tasks: Sequence[str],
-        slots: Sequence[Slot],
+        slots: Sequence[RemoteTrial],
         observations: Sequence[Mapping[str, np.ndarray]],
         indices: Sequence[int],
     ) -> list[np.ndarray | RemoteError]:
@@ -272,7 +278,7 @@ class RemotePolicy(PreTrainedPolicy):
         self._count_outage(answers)
         return [self._actions(slot, answer) for slot, answer in zip(slots, answers, strict=True)]
 
-    def _see(self, slot: Slot, observation: Mapping[str, np.ndarray]) -> None:
+    def _see(self, slot: RemoteTrial, observation: Mapping[str, np.ndarray]) -> None:
         if not self._checked:
             self._check_observation(observation)
             self._checked = True
@@ -282,7 +288,7 @@ class RemotePolicy(PreTrainedPolicy):
         while len(slot.frames) > self.translator.frames:
             slot.frames.popleft()
 
-    def _actions(self, slot: Slot, answer: Any) -> np.ndarray | RemoteError:
+    def _actions(self, slot: RemoteTrial, answer: Any) -> np.ndarray | RemoteError:
         if isinstance(answer, RemoteError):
             return answer
         slot.step += 1

@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.remote.connection import Connection, Request, Server, ServerOptions
+from lerobot_roborecover.remote.connection import Connection, RemoteServer, Request, ServerOptions
 from lerobot_roborecover.remote.errors import (
     MappingError,
     RemoteError,
@@ -208,7 +208,7 @@ def _one_action(payload: Any) -> np.ndarray:
     return action
 
 
-class EpisodeServer(Server):
+class EpisodeServer(RemoteServer):
     """A server as several episodes see it, each pinned to a connection of its own."""
 
     connection_class = EpisodeConnection

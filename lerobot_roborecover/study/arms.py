@@ -18,7 +18,7 @@ STARTS = ("recovery", "initial")
 
 
 @dataclass(frozen=True)
-class Arm:
+class StudyArm:
     """One run of `roborecover eval`."""
 
     name: str
@@ -43,7 +43,7 @@ class Arm:
         return self.out / "trials.jsonl"
 
 
-def arms(study: StudyDefinition, out: Path, ids: Sequence[str] = (), slots: int = 0) -> Iterator[Arm]:
+def arms(study: StudyDefinition, out: Path, ids: Sequence[str] = (), slots: int = 0) -> Iterator[StudyArm]:
     """Every run of the evaluation: each policy from both starts, then the interventions.
 
     Args:
@@ -65,7 +65,7 @@ def arms(study: StudyDefinition, out: Path, ids: Sequence[str] = (), slots: int 
         yield _arm(study, out, mode, "recovery", study.policies[study.base], policy, ids, slots)
 
 
-def report_command(study: StudyDefinition, done: Sequence[Arm], out: Path) -> str:
+def report_command(study: StudyDefinition, done: Sequence[StudyArm], out: Path) -> str:
     """The report on the runs' logs as a command line."""
     logs = [f"{arm.name}={arm.log}" for arm in done]
     argv = ["report", *logs, "--out", str(out / "report"), "--scenarios", str(study.scenarios)]
@@ -79,7 +79,7 @@ def report_command(study: StudyDefinition, done: Sequence[Arm], out: Path) -> st
 def _arm(
     study: StudyDefinition, out: Path, name: str, start: str, trials: int,
     policy: Mapping[str, Any], ids: Sequence[str], slots: int,
-) -> Arm:  # fmt: skip
+) -> StudyArm:  # fmt: skip
     folder = out / "trials" / f"{name}-{start}"
     env = {
         "scenarios": study.scenarios,
@@ -92,4 +92,4 @@ def _arm(
     # One observation a batch: an inference then rounds alike whoever else is waiting.
     runner = {"max_batch": 1, "portable": True, "slots": slots}
     run = RunSpec(study.platform, env, {**policy, "device": "cpu"}, trials, folder, runner=runner)
-    return Arm(name, start, trials, run)
+    return StudyArm(name, start, trials, run)

@@ -15,12 +15,12 @@ from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.rounding import has_kernels
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import Arm, arms, report_command
+from lerobot_roborecover.study.arms import StudyArm, arms, report_command
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import (
     STEPS_BAND,
-    Comparison,
+    ReproductionCheck,
     compare,
     outcomes_of,
     read_outcomes,
@@ -53,7 +53,7 @@ def evaluate(
     slots: int = 0,
     jobs: int = 0,
     say: Callable[[str], None] = print,
-) -> list[Arm]:
+) -> list[StudyArm]:
     """Runs every arm that is not finished.
 
     Args:
@@ -75,7 +75,7 @@ def evaluate(
     jobs = jobs or cores
     todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
 
-    def run(arm: Arm) -> float:
+    def run(arm: StudyArm) -> float:
         began, done = time.monotonic(), arm.out / DONE_FILE
         # With other slots the trials are the same: what has finished is not run again for them.
         same = json.dumps([replace(arm.run, runner={**arm.run.runner, "slots": 0}).config(), ids])
@@ -95,7 +95,7 @@ def evaluate(
     return todo
 
 
-def compare_with_stored(study: StudyDefinition, done: Sequence[Arm]) -> Comparison | None:
+def compare_with_stored(study: StudyDefinition, done: Sequence[StudyArm]) -> ReproductionCheck | None:
     """Today's outcomes against the stored ones, to the step where this processor can take the kernels that
     the study names; None where nothing is stored."""
     if not study.outcomes.exists():
@@ -104,7 +104,7 @@ def compare_with_stored(study: StudyDefinition, done: Sequence[Arm]) -> Comparis
     return compare(read_outcomes(study.outcomes), outcomes_of(done), band)
 
 
-def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Report:
+def write_report(study: StudyDefinition, done: Sequence[StudyArm], out: Path) -> Report:
     """Writes the report page of the arms' logs."""
     options = Options(baseline=study.base, interventions=tuple(study.interventions))
     return report(
@@ -116,7 +116,7 @@ def write_report(study: StudyDefinition, done: Sequence[Arm], out: Path) -> Repo
     )
 
 
-def run_arm(arm: Arm, study: StudyDefinition) -> None:
+def run_arm(arm: StudyArm, study: StudyDefinition) -> None:
     """Runs an arm in a process of its own, which rounds as the study says; its output goes into a file.
 
     Raises:

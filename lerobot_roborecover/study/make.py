@@ -40,7 +40,7 @@ _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
 
 
 @dataclass(frozen=True)
-class Stage:
+class StudyStage:
     """One step of making a study."""
 
     name: str
@@ -52,7 +52,7 @@ class Stage:
     """Results of an interrupted run that the commands would refuse to write over."""
 
 
-def stages(out: Path, chain: ChainConfig) -> list[Stage]:
+def stages(out: Path, chain: ChainConfig) -> list[StudyStage]:
     """The stages in their order; everything lies below `out`.
 
     Args:
@@ -71,13 +71,13 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
     donors = [part for name in screening if name != BASE for part in ("--donor", policy(name))]
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
-        Stage(
+        StudyStage(
             "policies",
             (("recipes.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
             tuple(out / "policies" / name for name in POLICIES),
         ),
         *(
-            Stage(
+            StudyStage(
                 name,
                 (("recipes.metaworld.scripted_operator", "--out", str(out / name),
                   "--seeds", seeds),),
@@ -86,12 +86,12 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
             )
             for name, seeds in DRIVEN.items()
         ),
-        Stage(
+        StudyStage(
             "scenarios",
             (_cli("build", str(out / CHAIN.name)),),
             (scenarios,),
         ),
-        Stage(
+        StudyStage(
             "donors",
             (_cli(
                 "donors", *logs, "--scenarios", str(scenarios), "--base", policy(BASE), *donors, *env,
@@ -100,7 +100,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
             (out / "donors" / "meta" / "roborecover" / "donors.json",),
             (out / "donors",),
         ),
-        Stage(
+        StudyStage(
             "correction",
             (
                 (_TRAIN, "--config_path=policies/train/correction_act.yaml", f"--policy.path={policy(BASE)}",
@@ -111,7 +111,7 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
             (out / "correction",),
             (correction,),
         ),
-        Stage(
+        StudyStage(
             "monitor data",
             (_cli(
                 "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
@@ -121,14 +121,14 @@ def stages(out: Path, chain: ChainConfig) -> list[Stage]:
             ),),
             (out / "monitor_data" / "validation_natural",),
         ),
-        Stage(
+        StudyStage(
             "monitor",
             ((_TRAIN, f"--config_path={_MONITOR}",
               f"--dataset.root={out / 'monitor_data' / 'train'}", f"--output_dir={monitor}"),),
             (monitor / "checkpoints" / _last_step(_MONITOR),),
             (monitor,),
         ),
-        Stage(
+        StudyStage(
             "monitor metrics",
             (_cli(
                 "eval-monitor", "--monitor", str(monitor / _CHECKPOINT),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import Arm
+from lerobot_roborecover.study.arms import StudyArm
 
 COLUMNS = ("arm", "scenario_id", "trial", "outcome", "steps")
 
@@ -25,7 +25,7 @@ STEPS_BAND = 2
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ReproductionCheck:
     """Trials of today against the stored ones."""
 
     same: int
@@ -58,7 +58,7 @@ class Comparison:
         return "\n".join(lines)
 
 
-def outcomes_of(arms: Iterable[Arm]) -> dict[Key, tuple[str, int]]:
+def outcomes_of(arms: Iterable[StudyArm]) -> dict[Key, tuple[str, int]]:
     """Outcomes in the arms' trial logs."""
     found = {}
     for arm in arms:
@@ -96,7 +96,7 @@ def read_outcomes(path: Path) -> dict[Key, tuple[str, int]]:
     return found
 
 
-def compare(stored: Outcomes, today: Outcomes, steps_band: int = 0) -> Comparison:
+def compare(stored: Outcomes, today: Outcomes, steps_band: int = 0) -> ReproductionCheck:
     """Compares the trials that are in both.
 
     Args:
@@ -111,7 +111,7 @@ def compare(stored: Outcomes, today: Outcomes, steps_band: int = 0) -> Compariso
         (before, then), (outcome, steps) = difference[1:]
         return before == outcome and abs(steps - then) <= steps_band
 
-    return Comparison(
+    return ReproductionCheck(
         same=len(both) - len(other),
         different=tuple(d for d in other if not near(d)),
         unknown=len(today.keys() - stored.keys()),

@@ -10,13 +10,13 @@ from pathlib import Path
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.env.trial_log import Protocol, make_row
 from lerobot_roborecover.scenario import Outcome, ScenarioError
-from lerobot_roborecover.study.arms import Arm, arms
+from lerobot_roborecover.study.arms import StudyArm, arms
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import read_outcomes
 from lerobot_roborecover.whole import write_whole
 
 
-def write_stored_logs(study: StudyDefinition, out: Path) -> list[Arm]:
+def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
     """Writes the stored outcomes as trial logs, one an arm.
 
     What `outcomes.csv` does not say is not in them: times, handoff errors, when an intervention acted.
@@ -68,7 +68,7 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[Arm]:
     return found
 
 
-def summary_table(done: Sequence[Arm]) -> str:
+def summary_table(done: Sequence[StudyArm]) -> str:
     """The policies' rates as Markdown: the table of README.md and docs/study.md.
 
     Args:

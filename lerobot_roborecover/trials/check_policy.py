@@ -71,7 +71,7 @@ class CheckPolicyConfig(RecoveryEvalConfig):
 
 
 @dataclass
-class Steps:
+class FirstSteps:
     """What the first steps in the simulator left."""
 
     observations: list[dict[str, Any]]
@@ -200,7 +200,7 @@ def _hand_off(run: Run, scenario: Scenario) -> EpisodeStart | Finding:
 
 def _take_steps(
     cfg: CheckPolicyConfig, host: Host, run: Run, scenario: Scenario, start: EpisodeStart
-) -> Steps | Finding:
+) -> FirstSteps | Finding:
     """A few steps, one action at a time, so that every observation is seen."""
     slot = run.pool.slots(1)[0]
     observations, actions, infer_s, step_s = [start.observation], [], [], []
@@ -246,7 +246,7 @@ def _take_steps(
     finally:
         host.finish(history)
     step = statistics.median(step_s)
-    return Steps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
+    return FirstSteps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
 
 
 def _look(
@@ -301,7 +301,7 @@ def _look(
     return found
 
 
-def _check_states(host: PolicyHost, scenario: Scenario, steps: Steps, platform: str) -> Finding:
+def _check_states(host: PolicyHost, scenario: Scenario, steps: FirstSteps, platform: str) -> Finding:
     batch = host.env_batch(steps.observations, [scenario.task.instruction] * len(steps.observations))
     key = "observation.state"
     if key not in batch:
@@ -336,7 +336,7 @@ def _check_trials(cfg: CheckPolicyConfig, host: Host, scenario: Scenario, observ
 
 
 def _estimate(
-    cfg: CheckPolicyConfig, host: Host, scenarios: ScenarioSet, scenario: Scenario, steps: Steps
+    cfg: CheckPolicyConfig, host: Host, scenarios: ScenarioSet, scenario: Scenario, steps: FirstSteps
 ) -> list[Finding]:
     """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
     slots = min(cfg.runner.slots or os.cpu_count() or 1, len(scenarios) * cfg.eval.n_episodes)

@@ -106,7 +106,7 @@ class Tally:
         return rate_estimate(rates, [self._units[scenario] for scenario in self._counts])
 
 
-class Shown(Protocol):
+class ProgressState(Protocol):
     """How far something is, as `ProgressLine` asks."""
 
     @property
@@ -158,7 +158,7 @@ class ProgressLine:
         self._shown_at = float("-inf")
         self._last = ""
 
-    def show(self, tally: Shown, *, final: bool = False) -> None:
+    def show(self, tally: ProgressState, *, final: bool = False) -> None:
         """Writes the line if it says something new."""
         now = self._clock()
         if self._done_before is None:
@@ -176,7 +176,7 @@ class ProgressLine:
         self._stream.flush()
         self._last, self._shown_at = text, now
 
-    def _text(self, tally: Shown, now: float) -> str:
+    def _text(self, tally: ProgressState, now: float) -> str:
         """The line: trials, running rate, time left."""
         parts = [f"{self._label:<9} {tally.done:>3}/{tally.total} {self._unit}"]
         if tally.rate is not None:

@@ -9,7 +9,7 @@ from lerobot_roborecover.env.trial import Trial, TrialState
 from lerobot_roborecover.policies.host import Replica
 from lerobot_roborecover.scenario import TrialStart
 from lerobot_roborecover.trials.units import Unit
-from lerobot_roborecover.trials.videos import Recording
+from lerobot_roborecover.trials.videos import VideoWriter
 from lerobot_roborecover.workers.messages import Reply
 
 
@@ -61,7 +61,7 @@ class Sitting:
     """Who has the trial's history; None once that is lost."""
     history: Any
     waiting_since: float = 0.0
-    recording: Recording | None = None
+    recording: VideoWriter | None = None
 
     @property
     def working(self) -> bool:

@@ -16,7 +16,7 @@ from lerobot_roborecover.trials.units import Unit
 KINDS = ("failures", "successes", "all")
 
 
-class Recording:
+class VideoWriter:
     """An MP4 that grows with its trial, so that no film is ever in memory.
 
     Args:
@@ -86,13 +86,13 @@ class VideoKeeper:
         """Whether a trial might be kept."""
         return len(self.kept) < self._count and (self._ids is None or unit.scenario.id in self._ids)
 
-    def begin(self, unit: Unit, frame: np.ndarray, fps: float) -> Recording:
+    def begin(self, unit: Unit, frame: np.ndarray, fps: float) -> VideoWriter:
         """A recording that starts with the handoff's frame."""
-        recording = Recording(self._folder / f"{unit.scenario.id}_trial{unit.trial}.part", fps)
+        recording = VideoWriter(self._folder / f"{unit.scenario.id}_trial{unit.trial}.part", fps)
         recording.add([frame])
         return recording
 
-    def finish(self, recording: Recording, unit: Unit, outcome: Outcome) -> None:
+    def finish(self, recording: VideoWriter, unit: Unit, outcome: Outcome) -> None:
         """Keeps or drops the film of a trial that has ended."""
         success = outcome is Outcome.SUCCESS
         fits = self._of not in ("failures", "successes") or success == (self._of == "successes")

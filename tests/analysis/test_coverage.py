@@ -24,7 +24,7 @@ from lerobot_roborecover.analysis.report_tables import overall
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.summary import summarise
-from lerobot_roborecover.analysis.units import Unit
+from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.trials.progress import Tally
@@ -189,7 +189,7 @@ def test_one_estimator_behind_every_table(tmp_path, capsys):
     assert run.rsr == row["RSR %"] == board.entries[0].rsr == both.rsr[0]
     assert tally.interval == (run.rsr.low, run.rsr.high)
     assert run.macro == row["Macro-4 %"] == board.entries[0].macro
-    by_trajectory = analyse(plain.study, Options(cluster=Unit.TRAJECTORY))
+    by_trajectory = analyse(plain.study, Options(cluster=ResamplingUnit.TRAJECTORY))
     wide = by_trajectory.ranked_rates[0]
     assert (by_trajectory.draws.units, by_trajectory.unit) == (10, "trajectory clusters")
     assert wide.high - wide.low > run.rsr.high - run.rsr.low

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.gallery import Clip
+from lerobot_roborecover.analysis.gallery import TrialVideo
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.report import Extras, write_report
 from lerobot_roborecover.analysis.results import Options, analyse
@@ -43,7 +43,7 @@ def report(tmp_path_factory):
     ]
     results = analyse(read_study([str(write_log(root / "log.jsonl", rows))]), Options(draws=200))
     frames = {s.id: png() for s in results.recovery.scenarios[::2]}
-    clips = {"s003": [Clip("alpha@1", "data:video/mp4;base64,AAAA")]}
+    clips = {"s003": [TrialVideo("alpha@1", "data:video/mp4;base64,AAAA")]}
     return results, write_report(results, root / "out", Extras(frames, clips)).html
 
 

@@ -26,7 +26,7 @@ from lerobot_roborecover.analysis.runs import (
     crossed_spread,
     hierarchical_bootstrap,
 )
-from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, Verdict
+from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
@@ -126,8 +126,8 @@ def test_a_scenario_that_a_run_lacks_is_not_counted_unless_it_failed(tmp_path):
 def test_of_methods_nothing_is_said_with_three_runs_and_something_with_more(tmp_path):
     few = [method(tmp_path, "a", (0.8, 0.82, 0.85)), method(tmp_path, "b", (0.2, 0.15, 0.2))]
     found = compare(read_study(few), options=QUICK)
-    assert found.decision is Verdict.A_BETTER
-    assert found.of_methods.verdict is Verdict.TOO_FEW_RUNS
+    assert found.decision is ComparisonVerdict.A_BETTER
+    assert found.of_methods.verdict is ComparisonVerdict.TOO_FEW_RUNS
     screen = to_screen(found)
     assert "Of the methods nothing is said, only of these runs: a has 3 and b has 3" in screen
     assert f"takes {LEAST_RUNS} runs of each" in screen.replace("\n", " ")
@@ -135,10 +135,10 @@ def test_of_methods_nothing_is_said_with_three_runs_and_something_with_more(tmp_
     many = tmp_path / "many"
     logs = [method(many, "a", (0.8, 0.82, 0.85, 0.8)), method(many, "b", (0.2, 0.15, 0.2, 0.2))]
     found = compare(read_study(logs), options=QUICK)
-    assert found.of_methods.verdict is Verdict.A_BETTER
+    assert found.of_methods.verdict is ComparisonVerdict.A_BETTER
     assert "Of the methods: a is better" in to_screen(found)
     turned = compare(read_study(logs), "b", "a", QUICK).of_methods
-    assert turned.verdict is Verdict.B_BETTER
+    assert turned.verdict is ComparisonVerdict.B_BETTER
     assert turned.difference.low == pytest.approx(-found.of_methods.difference.high)
 
 
@@ -149,8 +149,8 @@ def test_runs_that_scatter_separate_runs_but_not_methods(tmp_path):
         method(tmp_path, "b", (0.7, 0.05, 0.5, 0.4), count=80, trials=5),
     ]
     found = compare(read_study(logs), options=QUICK)
-    assert found.decision is Verdict.A_BETTER
-    assert found.of_methods.verdict is Verdict.NOT_SEPARATED
+    assert found.decision is ComparisonVerdict.A_BETTER
+    assert found.of_methods.verdict is ComparisonVerdict.NOT_SEPARATED
 
 
 def test_crossed_variance_is_that_of_a_balanced_layout():

@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
 from lerobot_roborecover.analysis.sequential_record import read_record, record_path
-from lerobot_roborecover.analysis.verdicts import Verdict
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
@@ -270,11 +270,11 @@ def test_a_report_knows_a_run_that_stopped(stopped, dataset, tmp_path):
         results = analyse(read_study(logs), options)
         assert results.left_out == ("push@1",)
         own = results.contrast("push@1", "lazy@1")
-        assert (own.verdict, own.sequential) == (Verdict.A_BETTER, True)
+        assert (own.verdict, own.sequential) == (ComparisonVerdict.A_BETTER, True)
         assert own.scenarios == read_record(root / "push" / "trials.jsonl").after_scenarios
         assert own.family == 2
         assert own.p <= own.p_holm
-        assert results.contrast("push@1", "third@1").verdict is Verdict.INCOMPLETE
+        assert results.contrast("push@1", "third@1").verdict is ComparisonVerdict.INCOMPLETE
         p = results.recovery.arm("push@1")
         assert (results.recovery.trials[p] > 0).sum() < COUNT, "what was not reached is no failure"
         assert any("its run was watched, and decided after" in r for r in results.remarks)
@@ -301,7 +301,7 @@ def test_compare_sequential_counts_scenarios_in_their_turn(tmp_path, capsys):
     found = compare(read_study(logs), options=Options(sequential=True)).contrast
     assert found.sequential
     assert found.scenarios <= 12
-    assert found.verdict is Verdict.A_BETTER
+    assert found.verdict is ComparisonVerdict.A_BETTER
     assert main(["compare", *logs, "--sequential"]) == 0
     write_log(tmp_path / "a.jsonl", later)
     assert main(["compare", *logs, "--sequential"]) == 2

@@ -23,7 +23,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.permutation import _random_flips, sign_flip_p
 from lerobot_roborecover.analysis.report_tables import interventions, oracle_table, overall, paired_contrasts
 from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.verdicts import Verdict
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
@@ -89,7 +89,7 @@ def test_headline_dots_table_and_compare_follow_one_rule(tmp_path):
     (close,) = [c for c in results.contrasts if (c.a, c.b) == ("p0", "p1")]
     assert close.p == pytest.approx(stats.binomtest(14, 18).pvalue)
     assert close.difference.low > 0, "alone, the interval leaves out zero"
-    assert (close.verdict, close.family) == (Verdict.NOT_SEPARATED, 15)
+    assert (close.verdict, close.family) == (ComparisonVerdict.NOT_SEPARATED, 15)
     assert "Not separated from it with these trials: p1." in headline(results)
     separate = sum(c.verdict.separated for c in results.contrasts)
     assert f"{separate} of 15 pairs are separated" in paired_differences(results).description
@@ -137,7 +137,7 @@ def test_a_policy_on_three_scenarios_wins_nothing(tmp_path):
     assert "lucky" not in oracle_bars(results).description
     assert not any("lucky" in str(row[0]) for row in oracle_table(results).rows)
     of_lucky = [c for c in results.contrasts if "lucky" in (c.a, c.b)]
-    assert {c.verdict for c in of_lucky} == {Verdict.INCOMPLETE}
+    assert {c.verdict for c in of_lucky} == {ComparisonVerdict.INCOMPLETE}
     assert all(math.isnan(c.p_holm) for c in of_lucky)
     assert next(c.family for c in results.contrasts if c.complete) == 1
     found = compare(results.study, "a", "lucky", QUICK)
@@ -192,13 +192,13 @@ def test_the_largest_complete_table():
 
 
 def test_five_differing_scenarios_are_no_verdict_and_six_may_be(tmp_path):
-    for differing, expected in ((5, Verdict.TOO_FEW), (6, Verdict.A_BETTER)):
+    for differing, expected in ((5, ComparisonVerdict.TOO_FEW), (6, ComparisonVerdict.A_BETTER)):
         both = study(
             tmp_path / str(differing), solved("a", set(range(20))), solved("b", set(range(differing, 20)))
         )
         results = analyse(both, QUICK)
         assert results.contrasts[0].verdict is expected
-        if expected is Verdict.TOO_FEW:
+        if expected is ComparisonVerdict.TOO_FEW:
             assert results.contrasts[0].difference.high > 0
             assert "No verdict on those that differ from it on fewer than 6 scenarios: b." in headline(
                 results

@@ -19,7 +19,7 @@ from PIL import Image
 
 from lerobot_roborecover.curation.annotation.discussion import Discussion
 from lerobot_roborecover.curation.annotation.examples import Examples
-from lerobot_roborecover.curation.annotation.frames import PACK, FrameStore, Videos
+from lerobot_roborecover.curation.annotation.frames import PACK, FramePacks, Videos
 from lerobot_roborecover.curation.annotation.guide import CELLS, SLUGS
 from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, ballot
 from lerobot_roborecover.curation.candidates import read_candidates
@@ -29,7 +29,7 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.annotate.identity import names_of
 from lerobot_roborecover.studio.annotate.queue import queue_order
 from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
-from lerobot_roborecover.studio.annotate.server import Study, VotingSession, make_app
+from lerobot_roborecover.studio.annotate.server import AnnotationStudy, VotingSession, make_app
 from lerobot_roborecover.studio.web.guard import MAX_BODY_BYTES, cookie_name
 from lerobot_roborecover.studio.web.serve import kept_tokens, listen
 from tests.support.candidate_files import CAMERAS, STEPS, candidate_dataset, number_of
@@ -69,7 +69,7 @@ class Annotator(httpx.Client):
 def serving(candidates, folder, names=("ann", "bob"), discussion=None):
     """A server on a port of its own; yields a client of each annotator, with the token as its cookie."""
     root = candidates.root
-    store = FrameStore(Videos(root), [row.steps for row in candidates.trajectories.rows])
+    store = FramePacks(Videos(root), [row.steps for row in candidates.trajectories.rows])
     queue = sorted(discussion.candidates if discussion else queued(candidates))
     rounds = discussion.round if discussion else 1
     called = names_of(candidates, folder)
@@ -79,7 +79,9 @@ def serving(candidates, folder, names=("ann", "bob"), discussion=None):
     listener = listen(0)
     host = f"127.0.0.1:{listener.getsockname()[1]}"
     pictures = Examples(root, "fake", render=False)
-    app = make_app(Study(candidates, called, store, pictures, annotators, frozenset({host}), discussion))
+    app = make_app(
+        AnnotationStudy(candidates, called, store, pictures, annotators, frozenset({host}), discussion)
+    )
     server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from lerobot_roborecover.curation.annotation import examples
-from lerobot_roborecover.curation.annotation.frames import FrameStore, Videos
+from lerobot_roborecover.curation.annotation.frames import FramePacks, Videos
 from lerobot_roborecover.curation.annotation.guide import SLUGS, slug
 from lerobot_roborecover.curation.annotation.naming import body_labels, camera_labels, hand_label
 from lerobot_roborecover.curation.annotation.traces import action_labels, suggest, traces
@@ -125,7 +125,7 @@ def test_a_damaged_video_is_one_answer_and_no_crash(tmp_path):
     root = candidate_dataset(tmp_path / "set", 1)
     (root / "videos" / CAMERAS[0] / "chunk-000/file-000.mp4").write_bytes(b"no video")
     with pytest.raises(ScenarioError, match=r"file-000.mp4 cannot be decoded"):
-        FrameStore(Videos(root), [STEPS]).pack(CAMERAS[0], 0, 0)
+        FramePacks(Videos(root), [STEPS]).pack(CAMERAS[0], 0, 0)
     outside = tmp_path / "outside.mp4"
     (root / "videos" / CAMERAS[1] / "chunk-000/file-000.mp4").rename(outside)
     (root / "videos" / CAMERAS[1] / "chunk-000/file-000.mp4").symlink_to(outside)

@@ -26,7 +26,7 @@ from lerobot_roborecover.studio.teleop.hub import Hub
 from lerobot_roborecover.studio.teleop.pilot import most_unseen
 from lerobot_roborecover.studio.teleop.serve import view_options
 from lerobot_roborecover.studio.teleop.server import Cockpit, make_app
-from lerobot_roborecover.studio.teleop.session import Session
+from lerobot_roborecover.studio.teleop.session import TeleopSession
 from lerobot_roborecover.studio.teleop.simulator_thread import SimulatorThread
 from lerobot_roborecover.studio.teleop.starts import continued, first_state
 from lerobot_roborecover.studio.teleop.store import Store, lacking, read_recording
@@ -86,7 +86,7 @@ def states(simulator, start, actions) -> list[str]:
 def check_exact(platform, task, moves, width, **options) -> None:
     """Drives and takes back at random; what is left must be what its actions alone give."""
     simulator, start = make_simulator(platform, **options), first_state(platform, task, seed=5)
-    session = Session(simulator, "ann")
+    session = TeleopSession(simulator, "ann")
     session.start(start)
     rng = np.random.default_rng(len(moves))
     for move in moves:
@@ -180,7 +180,7 @@ def test_one_process_holds_a_datasets_recordings(tmp_path):
 def test_a_rollout_is_continued_from_any_of_its_steps(tmp_path):
     dataset = candidate_dataset(tmp_path / "natural", 2)
     start = continued(dataset, "ep-0001", 20)
-    session = Session(make_simulator("fake"), "ann")
+    session = TeleopSession(make_simulator("fake"), "ann")
     session.start(start)
     assert session.step == 20
     recorded = read_candidates(dataset).steps(1).bodies["puck"][20, :3]
@@ -232,7 +232,7 @@ def test_lacking_counts_the_horizon_from_the_mark_inclusive():
 
 def test_a_recording_of_an_earlier_version_is_held_against_the_horizon_when_written(tmp_path):
     store, simulator = Store(tmp_path / "r"), make_simulator("fake", **view_options("fake", 16))
-    session = Session(simulator, "ann")
+    session = TeleopSession(simulator, "ann")
     session.start(first_state("fake", "push-left", seed=4))
     for _ in range(75):
         session.act(np.array([0.1, 0.0]), "script")

@@ -12,7 +12,7 @@ import pytest
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.controls import AXES
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.studio.teleop.pilot import HOLD_S, MAX_WAITING, Command, Pilot, Tick
+from lerobot_roborecover.studio.teleop.pilot import HOLD_S, MAX_WAITING, OperatorCommand, Pilot, Tick
 from lerobot_roborecover.studio.teleop.spacemouse import Reports, SpaceMouse
 from lerobot_roborecover.studio.teleop.starts import first_states
 from tests.support.processes import PATIENCE_S
@@ -119,7 +119,7 @@ def test_steps_lost_to_a_picture_are_made_up_for_up_to_a_limit(clock):
 def test_a_full_line_of_commands_refuses_more():
     pilot, answers = Pilot(1.0, 1.0), []
     for _ in range(300):
-        pilot.command(Command("status", {}, answers.append))
+        pilot.command(OperatorCommand("status", {}, answers.append))
     assert len(answers) == 44
     assert "does not keep up" in answers[0]["message"]
 
@@ -204,7 +204,7 @@ def test_a_spacemouse_drives_and_may_be_unplugged(tmp_path):
     event = pilot.poll(PATIENCE_S)
     assert isinstance(event, Tick)
     assert (event.axes[0], event.device) == (0.5, "spacemouse")
-    while not isinstance(event, Command):
+    while not isinstance(event, OperatorCommand):
         event = pilot.poll(PATIENCE_S)
     assert event.kind == "gripper"
     event.reply({"ok": True})

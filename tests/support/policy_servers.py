@@ -16,7 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from lerobot_roborecover.remote.connection import Request, Server, ServerOptions
+from lerobot_roborecover.remote.connection import RemoteServer, Request, ServerOptions
 from lerobot_roborecover.remote.protocol import pack, unpack
 from tests.support.processes import PATIENCE_S
 
@@ -71,7 +71,7 @@ class OpenpiServer:
 
 def server_at(url, **options):
     quick = {"timeout_s": 5.0, "wait_s": 0.3, "reconnect_s": 0.3, "connections": 2}
-    return Server(ServerOptions(url, **{**quick, **options}))
+    return RemoteServer(ServerOptions(url, **{**quick, **options}))
 
 
 def ask(url, *payloads, **options):

@@ -36,7 +36,7 @@ _HALF = 0.5
 
 
 @dataclass(frozen=True)
-class Clip:
+class EpisodeSpan:
     """Where an episode lies in one camera's video."""
 
     path: Path
@@ -73,7 +73,7 @@ class Videos:
                 raise ScenarioError(f"{path}: camera {camera!r:.80} is not a plain name")
         self._clips = self._read_clips()
 
-    def _read_clips(self) -> dict[tuple[str, int], Clip]:
+    def _read_clips(self) -> dict[tuple[str, int], EpisodeSpan]:
         parts = ("chunk_index", "file_index", "from_timestamp")
         columns = [f"videos/{camera}/{part}" for camera in self.cameras for part in parts]
         clips = {}
@@ -84,7 +84,9 @@ class Videos:
                     for camera in self.cameras:
                         chunk, file, start = (table[f"videos/{camera}/{part}"][row] for part in parts)
                         name = f"chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
-                        clips[camera, int(episode)] = Clip(self.root / "videos" / camera / name, float(start))
+                        clips[camera, int(episode)] = EpisodeSpan(
+                            self.root / "videos" / camera / name, float(start)
+                        )
             except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as err:
                 raise ScenarioError(f"{path} is not LeRobot's ({err!s:.200}); fetch it again") from None
         return clips
@@ -155,7 +157,7 @@ def encode_pack(frames: list[np.ndarray]) -> bytes:
     return b"".join([head, *parts])
 
 
-class FrameStore:
+class FramePacks:
     """Packs of frames, kept up to `CACHE_BYTES`, each made once however many ask for it.
 
     Args:

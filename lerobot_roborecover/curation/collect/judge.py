@@ -33,7 +33,7 @@ class Judging:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RolloutVerdict:
     """What becomes of a rollout."""
 
     planned: Planned
@@ -84,7 +84,7 @@ def _up(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
-def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging) -> Verdict:
+def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging) -> RolloutVerdict:
     """Judges one finished rollout; the same whenever it is asked.
 
     Args:
@@ -97,8 +97,8 @@ def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging)
         ScenarioError: its record is damaged.
     """
 
-    def drop(reason: str, detail: str, by: str) -> Verdict:
-        return Verdict(planned, Decision(planned.id, "collect", "dropped", reason, detail, by))
+    def drop(reason: str, detail: str, by: str) -> RolloutVerdict:
+        return RolloutVerdict(planned, Decision(planned.id, "collect", "dropped", reason, detail, by))
 
     if ended.outcome == Outcome.SUCCESS:
         return drop("succeeded", f"after {ended.steps} steps", "task predicate")
@@ -126,4 +126,4 @@ def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging)
             "body": touch.body, "displaced_mm": round(touch.displaced_mm, 2),
             "tilted_deg": round(touch.tilted_deg, 2), "undisturbed": twin.outcome,
         }  # fmt: skip
-    return Verdict(planned, None, judge(record, skip=judging.skip, only=judging.only), notes)
+    return RolloutVerdict(planned, None, judge(record, skip=judging.skip, only=judging.only), notes)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from lerobot_roborecover.curation.collect.judge import Verdict
+from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.record import RecorderSettings
 from lerobot_roborecover.curation.collect.rollouts import Ended, RolloutBook, run_expert, run_policy
@@ -115,7 +115,7 @@ def film_and_write(
     options: CollectOptions,
     spec: PlatformPart,
     book: RolloutBook,
-    kept: Sequence[Verdict],
+    kept: Sequence[RolloutVerdict],
     dropped: Sequence[Any],
     about: Mapping[str, Any],
 ) -> None:

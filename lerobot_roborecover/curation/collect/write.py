@@ -21,7 +21,7 @@ from lerobot_roborecover import __version__
 from lerobot_roborecover.curation.attrition import Decision, record_decisions
 from lerobot_roborecover.curation.candidates import Candidate, read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
-from lerobot_roborecover.curation.collect.judge import Verdict
+from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
 from lerobot_roborecover.curation.collect.server import Filmed, FilmJob
 from lerobot_roborecover.curation.film import Film
@@ -62,7 +62,7 @@ class Writing:
 
 def write_collection(
     out: Path,
-    kept: Sequence[Verdict],
+    kept: Sequence[RolloutVerdict],
     dropped: Iterable[Decision],
     writing: Writing,
     about: Mapping[str, Any],
@@ -138,7 +138,7 @@ class _NothingLeft(Exception):
 
 
 def _write_part(
-    part: Path, chunk: Sequence[Verdict], writing: Writing, on_film: Callable[[int], None]
+    part: Path, chunk: Sequence[RolloutVerdict], writing: Writing, on_film: Callable[[int], None]
 ) -> None:
     lost: dict[str, tuple[str, str]] = {}
     films = _films(chunk, writing, lost)
@@ -168,11 +168,11 @@ def _write_part(
 
 
 def _films(
-    chunk: Sequence[Verdict], writing: Writing, lost: dict[str, tuple[str, str]]
+    chunk: Sequence[RolloutVerdict], writing: Writing, lost: dict[str, tuple[str, str]]
 ) -> Iterator[Recording]:
     """Recordings of a part, as they are filmed; notes those that are lost, and why."""
 
-    def job(v: Verdict) -> FilmJob:
+    def job(v: RolloutVerdict) -> FilmJob:
         record = read_record(record_path(writing.records, v.planned.id))
         poses = record.steps.bodies
 
@@ -199,7 +199,7 @@ def _films(
         yield _recording(v, record, film, writing.film)
 
 
-def _recording(v: Verdict, record: Record, film: Filmed, filmed: Film) -> Recording:
+def _recording(v: RolloutVerdict, record: Record, film: Filmed, filmed: Film) -> Recording:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     planned = v.planned
@@ -219,7 +219,7 @@ def _recording(v: Verdict, record: Record, film: Filmed, filmed: Film) -> Record
     )
 
 
-def _part_name(chunk: Sequence[Verdict], frames: str) -> str:
+def _part_name(chunk: Sequence[RolloutVerdict], frames: str) -> str:
     """By what is in it, so that a part of other candidates, notes or pictures is another part."""
     text = [frames, [[v.planned.id, v.notes, v.exclusion and vars(v.exclusion)] for v in chunk]]
     return hashlib.sha256(json.dumps(text, sort_keys=True).encode()).hexdigest()[:20]

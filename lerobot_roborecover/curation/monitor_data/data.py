@@ -28,7 +28,7 @@ from lerobot_roborecover.curation.monitor_data.choice import (
     DataOptions,
     count,
 )
-from lerobot_roborecover.curation.monitor_data.frames import Job, replayed
+from lerobot_roborecover.curation.monitor_data.frames import RenderJob, replayed
 from lerobot_roborecover.datasets.trajectories import ScenarioLink, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.scenario import ScenarioError
@@ -170,7 +170,7 @@ def _trajectories(
     one = make_simulator(platform, **simulator)
     fps = round(one.control_hz)
     one.close()
-    jobs = [Job(c.continuation.scenario, c.continuation.actions, c.steps) for c in ordered]
+    jobs = [RenderJob(c.continuation.scenario, c.continuation.actions, c.steps) for c in ordered]
 
     def made() -> Iterator[Trajectory]:
         for number, (chosen, film) in enumerate(

@@ -19,7 +19,7 @@ from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
 
 @dataclass(frozen=True)
-class Job:
+class RenderJob:
     """A trajectory, and the steps to look at."""
 
     scenario: Scenario
@@ -30,7 +30,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Film:
+class RenderedSteps:
     """What was seen."""
 
     observations: list[Observation]
@@ -39,7 +39,7 @@ class Film:
     """The predicate after the last action."""
 
 
-def film(simulator: Simulator, job: Job) -> Film:
+def film(simulator: Simulator, job: RenderJob) -> RenderedSteps:
     """Replays one trajectory to its end; renders only what is asked for."""
     wanted = set(job.steps.tolist())
     simulator.reset(job.scenario.task, job.scenario.reset)
@@ -48,10 +48,10 @@ def film(simulator: Simulator, job: Job) -> Film:
     for step in follow(simulator, chain(job.scenario.prefix, job.actions)):
         if step in wanted:
             seen.append(simulator.observe())
-    return Film(seen, simulator.succeeded())
+    return RenderedSteps(seen, simulator.succeeded())
 
 
-def replayed(jobs: Sequence[Job], options: Mapping[str, Any], workers: int) -> Iterator[Film]:
+def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int) -> Iterator[RenderedSteps]:
     """Films of the jobs, in their order.
 
     Args:
@@ -71,5 +71,5 @@ def replayed(jobs: Sequence[Job], options: Mapping[str, Any], workers: int) -> I
         yield from pool.in_order(_film, jobs)
 
 
-def _film(job: Job) -> Film:
+def _film(job: RenderJob) -> RenderedSteps:
     return film(simulator_of_worker(), job)

@@ -50,7 +50,7 @@ class Waiting(Exception):
 
 
 @dataclass
-class Stage:
+class ChainStage:
     """One step of the chain."""
 
     name: str
@@ -173,7 +173,7 @@ class Chain:
         found["publish"] *= config.publish is not None
         return [label for name in STAGES[:before] for label in found[name]]
 
-    def _stages(self) -> Iterator[Stage]:
+    def _stages(self) -> Iterator[ChainStage]:
         """The stages in order; each is asked for its inputs only when its turn has come."""
         config, places, work = self.config, self.places, self.work
         for name, part in config.collect.items():
@@ -182,7 +182,7 @@ class Chain:
                 continue
             out = places.collected(name)
             options = requests.collect_options(config, name, part, out)
-            yield Stage(
+            yield ChainStage(
                 "collect",
                 f"collect {name}",
                 out,
@@ -190,19 +190,19 @@ class Chain:
                 lambda options=options: work.collect(options, self.say),
             )
         inputs = [Path(p.dataset) if p.dataset else places.collected(n) for n, p in config.collect.items()]
-        yield Stage(
+        yield ChainStage(
             "join", "join", places.candidates, [_identity(p) for p in inputs], lambda: self._join(inputs)
         )
-        yield Stage("annotate", "annotate", None, None, self._annotate, not self._open())
+        yield ChainStage("annotate", "annotate", None, None, self._annotate, not self._open())
         votes = {p.name: file_sha256(p) for p in sorted(places.votes.glob("*.jsonl"))}
-        yield Stage(
+        yield ChainStage(
             "agree",
             "agree",
             places.scenarios,
             [_options(config.annotate), votes, config.license],
             lambda: work.agree(requests.agree_request(config, places), self.say),
         )
-        yield Stage(
+        yield ChainStage(
             "screen",
             "screen",
             places.screened,
@@ -215,14 +215,14 @@ class Chain:
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"
         # `validate` itself leaves an empty record of rejections behind.
         looked = [file_sha256(p) for p in (rejects, people) if p and p.is_file() and p.stat().st_size]
-        yield Stage(
+        yield ChainStage(
             "validate",
             "validate",
             places.validated,
             [_options(config.validate), looked],
             lambda: work.validate(requests.validation_request(config, places), self.say),
         )
-        yield Stage(
+        yield ChainStage(
             "split",
             "split",
             places.split,
@@ -230,7 +230,7 @@ class Chain:
             lambda: work.split(places.validated, requests.split_config(config), places.split, self.say),
         )
         if config.render is not None:
-            yield Stage(
+            yield ChainStage(
                 "render",
                 "render",
                 places.rendered,
@@ -238,7 +238,7 @@ class Chain:
                 lambda: work.render(requests.render_request(config, places), self.say),
             )
         if (publish := config.publish) is not None:
-            yield Stage(
+            yield ChainStage(
                 "publish",
                 "publish",
                 None,
@@ -246,7 +246,7 @@ class Chain:
                 lambda: work.publish(requests.publish_request(publish, places), self.say),
             )
 
-    def _run(self, stage: Stage) -> None:
+    def _run(self, stage: ChainStage) -> None:
         """Runs a stage.
 
         Raises:
@@ -349,6 +349,6 @@ def _identity(dataset: Path) -> Any:
     return [[file_sha256(folder / n) for n in (CANDIDATES_FILE, STEPS_FILE)], decisions]
 
 
-def _key(before: str, stage: Stage) -> str:
+def _key(before: str, stage: ChainStage) -> str:
     text = json.dumps([before, stage.label, stage.identity], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

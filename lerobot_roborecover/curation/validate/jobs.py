@@ -16,7 +16,7 @@ from lerobot_roborecover.curation.film import Film, read_film
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial, env_config, read_trials
 from lerobot_roborecover.curation.validate.frames import TAIL
 from lerobot_roborecover.curation.validate.originals import OriginalFrames
-from lerobot_roborecover.curation.validate.replay import DrawnRun, ReplayJob, Rollout
+from lerobot_roborecover.curation.validate.replay import DrawnRun, OriginalRollout, ReplayJob
 from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.curation.validate.validation import draw_runs
 from lerobot_roborecover.datasets.frames import KEPT
@@ -131,7 +131,7 @@ def _film_options(film: Film, request: ValidationRequest) -> dict[str, Any]:
     return {k: v for k, v in film.options.items() if k in _FILM_OPTIONS and k not in named}
 
 
-def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Rollout | None, Film]:
+def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[OriginalRollout | None, Film]:
     """The rollout that a scenario was made from, around its recovery point, and how it was filmed."""
     for found in sets:
         episode = found.by_id.get(scenario.id)
@@ -147,7 +147,7 @@ def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Rollout 
         around = range(max(step - KEPT + 1, 0), last + 1)
         film = read_film(found.row(episode).provenance, f"{found.root}: candidate {scenario.id}")
         poses = {s: steps.poses_at(s) for s in around}
-        return Rollout(poses, actions[step:last], len(actions), film.every), film
+        return OriginalRollout(poses, actions[step:last], len(actions), film.every), film
     return None, Film()
 
 

@@ -40,7 +40,7 @@ class DrawnRun:
 
 
 @dataclass(frozen=True)
-class Rollout:
+class OriginalRollout:
     """The rollout that a scenario was made from, around its recovery point."""
 
     poses: Mapping[int, Mapping[str, Pose]]
@@ -61,7 +61,7 @@ class ReplayJob:
     runs: tuple[DrawnRun, ...]
     options: Mapping[str, Any]
     """Of the simulator."""
-    rollout: Rollout | None = None
+    rollout: OriginalRollout | None = None
     originals: Originals | None = None
     """None compares no frames."""
     sheet: Path | None = None
@@ -74,7 +74,7 @@ class _InvalidAction(Exception):
 
 
 @dataclass
-class _Seen:
+class _ReplayTrace:
     """What a replay met, by step."""
 
     bodies: dict[int, dict[str, Pose]] = field(default_factory=dict)
@@ -134,7 +134,7 @@ def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> Replays:
     )
 
 
-def _seen_from(scenario: Scenario, originals: Originals | None, rollout: Rollout | None) -> int:
+def _seen_from(scenario: Scenario, originals: Originals | None, rollout: OriginalRollout | None) -> int:
     """The first step whose picture is needed."""
     step = len(scenario.prefix)
     first = max(step - KEPT + 1, 0)
@@ -170,9 +170,9 @@ def _follow(
     return follow(_Refusing(simulator, what, count(first)), actions, first)
 
 
-def _walk(simulator: Simulator, scenario: Scenario, first: int, pictures: bool) -> _Seen:
+def _walk(simulator: Simulator, scenario: Scenario, first: int, pictures: bool) -> _ReplayTrace:
     """Resets, replays the prefix, and looks from a step on."""
-    seen = _Seen()
+    seen = _ReplayTrace()
     simulator.reset(scenario.task, scenario.reset)
     for step in _follow(simulator, scenario.prefix, lambda n: f"prefix action {n}"):
         if step >= first:
@@ -180,14 +180,14 @@ def _walk(simulator: Simulator, scenario: Scenario, first: int, pictures: bool) 
     return seen
 
 
-def _look(simulator: Simulator, scenario: Scenario, step: int, seen: _Seen, pictures: bool) -> None:
+def _look(simulator: Simulator, scenario: Scenario, step: int, seen: _ReplayTrace, pictures: bool) -> None:
     seen.bodies[step] = simulator.bodies()
     if pictures:
         seen.pictures[step] = camera_pictures(scenario.platform, simulator.observe())
 
 
 def _go_on(
-    simulator: Simulator, scenario: Scenario, actions: np.ndarray, seen: _Seen, pictures: bool
+    simulator: Simulator, scenario: Scenario, actions: np.ndarray, seen: _ReplayTrace, pictures: bool
 ) -> None:
     """The rollout's own further steps."""
     t = len(scenario.prefix)
@@ -196,7 +196,9 @@ def _go_on(
             _look(simulator, scenario, step, seen, pictures)
 
 
-def _replay_run(simulator: Simulator, job: ReplayJob, run: DrawnRun, first: int) -> tuple[RunReplay, _Seen]:
+def _replay_run(
+    simulator: Simulator, job: ReplayJob, run: DrawnRun, first: int
+) -> tuple[RunReplay, _ReplayTrace]:
     """Prefix and run, once."""
     from lerobot_roborecover.rewind import Trail
 
@@ -248,13 +250,13 @@ def _displacements(
 
 
 def _compare_frames(
-    job: ReplayJob, seen: Sequence[_Seen], tail: Mapping[int, Mapping[str, np.ndarray]]
+    job: ReplayJob, seen: Sequence[_ReplayTrace], tail: Mapping[int, Mapping[str, np.ndarray]]
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, np.ndarray] | None]:
     """SSIM by camera of the replay that fares worst, and its frames."""
     assert job.originals is not None
     found: dict[str, tuple[float, ...]] = {}
     worst: dict[str, np.ndarray] | None = None
-    before: list[_Seen] = []
+    before: list[_ReplayTrace] = []
     for met in seen:
         if any(_same(met, other) for other in before):
             continue
@@ -270,7 +272,7 @@ def _least(values: Mapping[str, Sequence[float]]) -> float:
     return min(float(np.mean(v)) for v in values.values())
 
 
-def _same(one: _Seen, other: _Seen) -> bool:
+def _same(one: _ReplayTrace, other: _ReplayTrace) -> bool:
     return all(
         np.array_equal(picture, other.pictures[step][camera])
         for step, pictures in one.pictures.items()
@@ -279,7 +281,7 @@ def _same(one: _Seen, other: _Seen) -> bool:
 
 
 def _frames(
-    job: ReplayJob, met: _Seen, tail: Mapping[int, Mapping[str, np.ndarray]]
+    job: ReplayJob, met: _ReplayTrace, tail: Mapping[int, Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
     """(K, H, W, 3) uint8 by camera, encoded as the originals were."""
     assert job.originals is not None

@@ -11,7 +11,7 @@ from lerobot.envs.configs import LiberoEnv
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
-    Filmed,
+    FilmedEnvConfig,
     SimulatorSetup,
     check_quality,
     chosen_quality,
@@ -23,7 +23,7 @@ from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 
 
 @dataclass
-class LiberoConfig(LiberoEnv, Filmed):
+class LiberoConfig(LiberoEnv, FilmedEnvConfig):
     """Recovery scenarios on LIBERO."""
 
     assets_dir: str = ""

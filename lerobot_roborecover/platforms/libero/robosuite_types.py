@@ -42,7 +42,7 @@ class _Gripper(Protocol):
     """(2,) float64; (1,) or (2,) after a step."""
 
 
-class Controller(Protocol):
+class OperationalSpaceController(Protocol):
     """robosuite's `OperationalSpaceController`."""
 
     ee_ori_mat: np.ndarray
@@ -62,10 +62,10 @@ class _RobotModel(Protocol):
     root_body: str
 
 
-class Arm(Protocol):
+class SingleArm(Protocol):
     """robosuite's `SingleArm`."""
 
-    controller: Controller
+    controller: OperationalSpaceController
     eef_site_id: int
     gripper: _Gripper
     robot_model: _RobotModel
@@ -104,7 +104,7 @@ class LiberoEnv(Protocol):
     parsed_problem: Mapping[str, Any]
     """The BDDL file, as LIBERO parsed it."""
     placement_initializer: _Placement
-    robots: Sequence[Arm]
+    robots: Sequence[SingleArm]
     sim: Sim
     workspace_offset: Sequence[float]
     """(3,) metres."""

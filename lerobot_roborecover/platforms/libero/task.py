@@ -39,7 +39,7 @@ from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Pose
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.platforms.libero.robosuite_types import Arm, LiberoEnv
+    from lerobot_roborecover.platforms.libero.robosuite_types import LiberoEnv, SingleArm
 
 _ENDLESS = 2**31 - 1
 """Horizon given to robosuite, which otherwise ends an episode after 1,000 steps whatever its outcome."""
@@ -122,7 +122,7 @@ class LiberoTask:
         return self.env.sim.data._data
 
     @property
-    def robot(self) -> Arm:
+    def robot(self) -> SingleArm:
         """robosuite's single-arm robot."""
         return self.env.robots[0]
 

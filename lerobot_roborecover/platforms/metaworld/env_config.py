@@ -9,7 +9,7 @@ from lerobot.envs.configs import MetaworldEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.platforms.base import (
-    Filmed,
+    FilmedEnvConfig,
     SimulatorSetup,
     check_quality,
     chosen_quality,
@@ -20,7 +20,7 @@ from lerobot_roborecover.platforms.base import (
 
 
 @dataclass
-class MetaworldConfig(MetaworldEnv, Filmed):
+class MetaworldConfig(MetaworldEnv, FilmedEnvConfig):
     """Recovery scenarios on Meta-World."""
 
     observation_height: int = 480

@@ -10,7 +10,13 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import Filmed, SimulatorSetup, first_camera, no_video, refuse_unused
+from lerobot_roborecover.platforms.base import (
+    FilmedEnvConfig,
+    SimulatorSetup,
+    first_camera,
+    no_video,
+    refuse_unused,
+)
 from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 from lerobot_roborecover.platforms.robotwin.processors import (
     MOSAIC,
@@ -21,7 +27,7 @@ from lerobot_roborecover.platforms.robotwin.processors import (
 
 
 @dataclass
-class RobotwinConfig(RoboTwinEnvConfig, Filmed):
+class RobotwinConfig(RoboTwinEnvConfig, FilmedEnvConfig):
     """Recovery scenarios on RoboTwin 2.0."""
 
     robotwin_root: str = ""

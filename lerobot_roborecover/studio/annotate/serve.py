@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.curation.annotation.examples import Examples
-from lerobot_roborecover.curation.annotation.frames import FrameStore, Videos
+from lerobot_roborecover.curation.annotation.frames import FramePacks, Videos
 from lerobot_roborecover.curation.annotation.votes import VoteBook, check_name, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
@@ -52,13 +52,13 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
     try:
         import uvicorn  # noqa: F401 - what is missing is said before anything is read
 
-        from lerobot_roborecover.studio.annotate.server import Study, VotingSession, make_app
+        from lerobot_roborecover.studio.annotate.server import AnnotationStudy, VotingSession, make_app
     except ImportError as err:
         raise ScenarioError(
             f"the page needs {err.name}: pip install 'lerobot_env_roborecover[build]'"
         ) from None
     candidates = read_candidates(config.dataset)
-    frames = FrameStore(Videos(config.dataset), [row.steps for row in candidates.trajectories.rows])
+    frames = FramePacks(Videos(config.dataset), [row.steps for row in candidates.trajectories.rows])
     wanted, discussion = to_vote_on(candidates, config.only)
     folder = votes_folder(config.dataset, config.votes)
     names = [check_name(name) for name in config.annotators]
@@ -77,7 +77,9 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
                 tokens[name], books[-1], queue_order(sorted(wanted), name, config.seed)
             )
         called = names_of(candidates, folder)
-        app = make_app(Study(candidates, called, frames, examples, annotators, own_hosts(port), discussion))
+        app = make_app(
+            AnnotationStudy(candidates, called, frames, examples, annotators, own_hosts(port), discussion)
+        )
         for name in names:
             done = len(set(annotators[name].book.ballot().votes) & wanted)
             say(f"{name}: {done} of {len(wanted)} done  http://{HOST}:{port}/{name}/?token={tokens[name]}")

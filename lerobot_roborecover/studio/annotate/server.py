@@ -24,7 +24,7 @@ from starlette.routing import Route
 
 from lerobot_roborecover.curation.annotation.discussion import Discussion
 from lerobot_roborecover.curation.annotation.examples import Examples
-from lerobot_roborecover.curation.annotation.frames import PACK, FrameStore
+from lerobot_roborecover.curation.annotation.frames import PACK, FramePacks
 from lerobot_roborecover.curation.annotation.guide import SLUGS, as_json
 from lerobot_roborecover.curation.annotation.naming import camera_labels
 from lerobot_roborecover.curation.annotation.shown import take_vote
@@ -55,13 +55,13 @@ class VotingSession:
 
 
 @dataclass(frozen=True)
-class Study:
+class AnnotationStudy:
     """Everything that is served."""
 
     candidates: CandidateSet
     names: Names
     """What annotators call the dataset and its episodes."""
-    frames: FrameStore
+    frames: FramePacks
     examples: Examples
     annotators: Mapping[str, VotingSession]
     """By annotator."""
@@ -73,7 +73,7 @@ class Study:
 class Handlers:
     """The answers, once a request has been checked."""
 
-    def __init__(self, study: Study):
+    def __init__(self, study: AnnotationStudy):
         self.study = study
 
     def annotator(self, request: Request) -> VotingSession:
@@ -255,7 +255,7 @@ class Handlers:
         return vote_json(vote, self.study.names.episodes.get(vote.candidate, ""))
 
 
-def make_app(study: Study) -> Starlette:
+def make_app(study: AnnotationStudy) -> Starlette:
     """The application."""
     handlers = Handlers(study)
     routes = [

@@ -42,7 +42,7 @@ def most_unseen(rate_hz: float, fps: float) -> int:
 
 
 @dataclass(frozen=True)
-class Command:
+class OperatorCommand:
     """Something that is asked for, other than held inputs."""
 
     kind: str
@@ -87,7 +87,9 @@ class Pilot:
     closed: bool = False
     """The gripper's last command."""
     realtime: bool = False
-    _queue: queue.Queue[Command | tuple[str, Hold]] = field(default_factory=lambda: queue.Queue(MAX_WAITING))
+    _queue: queue.Queue[OperatorCommand | tuple[str, Hold]] = field(
+        default_factory=lambda: queue.Queue(MAX_WAITING)
+    )
     _holds: dict[str, Hold] = field(default_factory=dict)
     _owed: int = 0
     """Steps for the gripper."""
@@ -104,7 +106,7 @@ class Pilot:
         except queue.Full:
             return  # it is said again
 
-    def command(self, command: Command) -> None:
+    def command(self, command: OperatorCommand) -> None:
         """Puts a command in line; one that does not fit is refused at once."""
         try:
             self._queue.put_nowait(command)
@@ -123,7 +125,9 @@ class Pilot:
         self.closed = not self.closed
         self._owed = max(self._owed, round(GRIPPER_SECONDS * self.control_hz))
 
-    def poll(self, timeout_s: float, drive: bool = True, paused: bool = False) -> Command | Tick | None:
+    def poll(
+        self, timeout_s: float, drive: bool = True, paused: bool = False
+    ) -> OperatorCommand | Tick | None:
         """What is to be done next.
 
         Args:
@@ -147,7 +151,7 @@ class Pilot:
                 if time.monotonic() >= deadline:
                     return None
                 continue
-            if isinstance(item, Command):
+            if isinstance(item, OperatorCommand):
                 return item
             if not drive:
                 continue  # what is held is said again once it counts

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.teleop.hub import Hub, Viewer
-from lerobot_roborecover.studio.teleop.pilot import Command, Pilot
+from lerobot_roborecover.studio.teleop.pilot import OperatorCommand, Pilot
 from lerobot_roborecover.studio.teleop.protocol import VERSION, held_axes, parse
 from lerobot_roborecover.studio.web.guard import Refusal, check_token, guarded, with_cookie
 from lerobot_roborecover.studio.web.page import PageFiles
@@ -129,7 +129,7 @@ class _Connection:
                 device = "gamepad" if sent.get("device") == "gamepad" else "keyboard"
                 self._pilot.hold(device, held_axes(dict(sent)), bool(sent.get("wait")))
             else:
-                self._pilot.command(Command(kind, dict(sent), self._answer_of(viewer, identity)))
+                self._pilot.command(OperatorCommand(kind, dict(sent), self._answer_of(viewer, identity)))
         except ScenarioError as err:
             self._reply(viewer, identity, {"ok": False, "message": str(err)})
 

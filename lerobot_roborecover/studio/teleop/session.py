@@ -45,7 +45,7 @@ class Mark:
     deviation: str = ""
 
 
-class Session:
+class TeleopSession:
     """Drives one simulator from a start.
 
     Args:

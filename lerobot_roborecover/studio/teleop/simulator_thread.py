@@ -16,14 +16,20 @@ from lerobot_roborecover.datasets.frames import camera_pictures
 from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.teleop.hub import Hub
-from lerobot_roborecover.studio.teleop.pilot import Command, Pilot, Tick, most_unseen, steps_per_picture
+from lerobot_roborecover.studio.teleop.pilot import (
+    OperatorCommand,
+    Pilot,
+    Tick,
+    most_unseen,
+    steps_per_picture,
+)
 from lerobot_roborecover.studio.teleop.protocol import (
     MAX_ACTIONS,
     MAX_BACK,
     plain_text,
     whole_number,
 )
-from lerobot_roborecover.studio.teleop.session import Session
+from lerobot_roborecover.studio.teleop.session import TeleopSession
 from lerobot_roborecover.studio.teleop.starts import StartPoint, first_state, next_open
 from lerobot_roborecover.studio.teleop.status import encode, exact_state, of_session
 from lerobot_roborecover.studio.teleop.store import Store, read_recording
@@ -93,7 +99,7 @@ class SimulatorThread(threading.Thread):
         """Until `stop`."""
         try:
             simulator = self._make()
-            self._session = Session(simulator, self._operator)
+            self._session = TeleopSession(simulator, self._operator)
         except Exception as err:  # whatever a simulator's import or driver raises is told to whoever waits
             self.error = err
             self.ready.set()
@@ -111,14 +117,14 @@ class SimulatorThread(threading.Thread):
     def stop(self) -> None:
         """Ends the thread after what it is doing."""
         self._stopped.set()
-        self.pilot.command(Command("status", {}, lambda _answer: None))
+        self.pilot.command(OperatorCommand("status", {}, lambda _answer: None))
 
     # --- one turn
 
     def _turn(self) -> None:
         paused = self._hub.unseen(self._taken) >= most_unseen(self.pilot.rate_hz, self._fps)
         event = self.pilot.poll(self._wait_s(paused), drive=self._driving, paused=paused)
-        if isinstance(event, Command):
+        if isinstance(event, OperatorCommand):
             self._answer(event)
         elif isinstance(event, Tick):
             self._step(event)
@@ -210,7 +216,7 @@ class SimulatorThread(threading.Thread):
         self._broken = str(err) or type(err).__name__
         return self._broken
 
-    def _answer(self, command: Command) -> None:
+    def _answer(self, command: OperatorCommand) -> None:
         self._broken = ""
         try:
             if self._previewing and command.kind not in _IN_PREVIEWS:

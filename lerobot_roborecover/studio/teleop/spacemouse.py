@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.studio.teleop.pilot import Command, Pilot
+from lerobot_roborecover.studio.teleop.pilot import OperatorCommand, Pilot
 
 _LOG = logging.getLogger(__name__)
 VENDORS = (0x256F, 0x046D)
@@ -123,7 +123,7 @@ class SpaceMouse(threading.Thread):
                 self._pilot.hold("spacemouse", axes)
             for button in pressed:
                 if button < len(BUTTONS):
-                    self._pilot.command(Command(BUTTONS[button], {}, _report_refusal))
+                    self._pilot.command(OperatorCommand(BUTTONS[button], {}, _report_refusal))
         if self._device is not None:
             self._device.close()
 

@@ -9,12 +9,12 @@ import numpy as np
 from lerobot_roborecover.platforms.controls import AXES
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Pose
-from lerobot_roborecover.studio.teleop.session import Session
+from lerobot_roborecover.studio.teleop.session import TeleopSession
 
 JPEG_QUALITY = 80
 
 
-def of_session(session: Session) -> dict[str, Any]:
+def of_session(session: TeleopSession) -> dict[str, Any]:
     """The session's part of a status message."""
     simulator, controls, start = session.simulator, session.controls, session.start_point
     status: dict[str, Any] = {
@@ -43,7 +43,7 @@ def of_session(session: Session) -> dict[str, Any]:
     }
 
 
-def exact_state(session: Session) -> dict[str, Any]:
+def exact_state(session: TeleopSession) -> dict[str, Any]:
     """Everything that a script may want to see, exactly."""
     low_dim = getattr(session.simulator, "low_dim", None)
     return {

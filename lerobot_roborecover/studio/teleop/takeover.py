@@ -21,7 +21,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import Platform, all_platforms
 from lerobot_roborecover.platforms.controls import AXES, Controls
 from lerobot_roborecover.studio.teleop.hub import Hub
-from lerobot_roborecover.studio.teleop.pilot import Command, Pilot, Tick, most_unseen
+from lerobot_roborecover.studio.teleop.pilot import OperatorCommand, Pilot, Tick, most_unseen
 from lerobot_roborecover.studio.teleop.status import encode
 from lerobot_roborecover.studio.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 
@@ -36,7 +36,7 @@ _STATE, _IMAGES = "observation.state", "observation.image"
 
 
 @dataclass
-class Slot:
+class TakeoverSlot:
     """One takeover."""
 
     instruction: str
@@ -58,7 +58,7 @@ class Takeover:
         from lerobot_roborecover.studio.teleop.server import NAME, Cockpit, make_app
 
         self._hub, self._pilot = Hub(), Pilot(20.0, 20.0)
-        self._slot: Slot | None = None
+        self._slot: TakeoverSlot | None = None
         self._problem = ""
         self._taken = 0
         listener = listen(port)
@@ -73,7 +73,7 @@ class Takeover:
         server.start()
         print(f"takeovers are driven at {self.address}", file=sys.stderr, flush=True)
 
-    def take(self, instruction: str) -> Slot:
+    def take(self, instruction: str) -> TakeoverSlot:
         """See `Driver.take`.
 
         Raises:
@@ -84,11 +84,11 @@ class Takeover:
                 "a person drives one simulator at a time: --eval.batch_size=1, and for roborecover eval "
                 "--runner.slots=1. Finished trials are in the log; the same command goes on after them"
             )
-        self._slot = Slot(instruction)
+        self._slot = TakeoverSlot(instruction)
         print(f"a person is needed: {instruction}  {self.address}", file=sys.stderr, flush=True)
         return self._slot
 
-    def act(self, slot: Slot, observation: Mapping[str, torch.Tensor]) -> np.ndarray | None:
+    def act(self, slot: TakeoverSlot, observation: Mapping[str, torch.Tensor]) -> np.ndarray | None:
         """See `Driver.act`; waits for the person."""
         if slot.controls is None:
             self._begin(slot, observation)
@@ -106,27 +106,27 @@ class Takeover:
             if isinstance(event, Tick):
                 slot.step, self._taken = slot.step + 1, self._taken + 1
                 return slot.controls.action(event.axes, event.closed).astype(np.float32)
-            if isinstance(event, Command) and self._answer(event):
+            if isinstance(event, OperatorCommand) and self._answer(event):
                 return None
 
-    def leave(self, slot: Slot) -> None:
+    def leave(self, slot: TakeoverSlot) -> None:
         """See `Driver.leave`."""
         self._slot = None
         self._pilot.let_go()
         self._publish()
 
-    def _begin(self, slot: Slot, observation: Mapping[str, torch.Tensor]) -> None:
+    def _begin(self, slot: TakeoverSlot, observation: Mapping[str, torch.Tensor]) -> None:
         platform = _platform_of(observation)
         slot.controls = platform.controls()
         self._pilot.rate_hz = self._pilot.control_hz = platform.control_hz
         while (early := self._pilot.poll(0.0, drive=False)) is not None:
-            if isinstance(early, Command):
+            if isinstance(early, OperatorCommand):
                 early.reply({"ok": False, "message": "there was nothing to drive yet"})
         self._pilot.let_go()
         # Whoever takes over must not drop what the policy holds.
         self._pilot.closed = platform.gripper_closed(observation[_STATE].detach().cpu().numpy())
 
-    def _answer(self, command: Command) -> bool:
+    def _answer(self, command: OperatorCommand) -> bool:
         """Answers a command; True where the slot is handed back."""
         self._problem = ""
         good, back = True, command.kind == "hand_back"
