@@ -73,7 +73,7 @@ def roc(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
         return rates[0], rates[1]
 
     def under(x: np.ndarray, y: np.ndarray) -> float:
-        return float(np.trapezoid(y, x))
+        return float(np.trapezoid(y, x)) if len(x) > 1 else np.nan  # no answer, no curve
 
     x, y = curve(np.ones(len(rows)))
     left_out = [under(*curve(rows != i)) for i in range(count)]

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from lerobot_roborecover.analysis.intervals import jackknife, rate_interval
 from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames, metric_columns
 from lerobot_roborecover.analysis.monitor_curves import choose_threshold
-from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, write_monitor_report
+from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, to_json, write_monitor_report
 from lerobot_roborecover.analysis.monitor_report import monitor_report
 from lerobot_roborecover.analysis.published import table as published_table
 
@@ -154,6 +155,13 @@ def test_a_chosen_threshold_is_the_best_of_all(noisy, rule):
 def monitor_counts(f: MonitorFrames) -> tuple[int, int, int, int]:
     y, d = f.label == 1, f.decision
     return int((~y & ~d).sum()), int((~y & d).sum()), int((y & ~d).sum()), int((y & d).sum())
+
+
+def test_without_an_answer_that_can_be_read_there_is_no_area(noisy):
+    unread = replace(noisy, score=np.full(len(noisy.score), np.nan))
+    report = to_json(monitor_report(unread))
+    assert report["unparsed"] == len(noisy.label)
+    assert report["auroc"] == {"value": None, "low": None, "high": None}
 
 
 @pytest.mark.parametrize("rule", ["best", "fpr", "fpr=2", "f1=0.5"])
