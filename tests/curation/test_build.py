@@ -328,9 +328,8 @@ def ran(text: str) -> list[str]:
     return [line[line.index("] ") + 2 : -6] for line in text.splitlines() if line.endswith(": runs")]
 
 
-@pytest.mark.lerobot
-@pytest.mark.slow
-def test_from_rollouts_to_episodes(build, capsys):
+def whole_build(build, capsys) -> list:
+    """From rollouts to episodes, with people in between; its scenarios."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     assert build("--until", "collect") == 0
@@ -361,11 +360,24 @@ def test_from_rollouts_to_episodes(build, capsys):
         assert f"| {stage} |" in funnel
     assert (build.root / "summary" / "build.yaml").is_file()
     assert "leakage by trajectory: none" in (build.root / "summary" / "splits.txt").read_text()
+    return final
 
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_from_rollouts_to_episodes(build, capsys):
+    whole_build(build, capsys)
     # Nothing has changed, nothing runs; a faster pace is no change.
-    loads = len(build.loads)
     assert build(content=changed(build.whole, "validate.workers", 1)) == 0
     assert ran(capsys.readouterr().out) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_what_is_changed_is_made_anew(build, capsys):
+    final = whole_build(build, capsys)
+    loads = len(build.loads)
     # What is changed is made anew, with all after it, from the trials and replays that are there.
     replays = (build.root / "validated.replays" / "replays.jsonl").read_bytes()
     assert build(content=changed(build.whole, "screen.max_invalid", 1)) == 0

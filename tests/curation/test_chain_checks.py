@@ -207,6 +207,7 @@ def test_numbers_of_things():
 
 
 @pytest.mark.lerobot
+@pytest.mark.nightly
 def test_rendering_ends_in_a_lerobot_dataset_that_knows_what_was_decided(tmp_path, capsys):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

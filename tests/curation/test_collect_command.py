@@ -81,6 +81,7 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
 
 
 @pytest.mark.lerobot
+@pytest.mark.nightly
 def test_a_policy_collects_the_same_whatever_the_slots(tmp_path, capsys):
     policy = save_policy(tmp_path / "act")
     common = [f"--policy.path={policy}", "--seeds=0-1", "--frames=none", "--env.obs_type=state"]

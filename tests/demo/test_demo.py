@@ -172,6 +172,7 @@ def test_a_failed_run_shows_the_end_of_its_output_and_goes_on_when_rerun(setting
     assert "RSR) " in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 def test_a_killed_demo_leaves_no_run_behind_that_holds_the_log(settings, tmp_path):
     child = tmp_path / "child"
     hangs = tmp_path / "hangs.py"
@@ -196,6 +197,7 @@ def test_a_killed_demo_leaves_no_run_behind_that_holds_the_log(settings, tmp_pat
     assert len(read_trial_log(settings().trial_log)) == 16
 
 
+@pytest.mark.nightly
 def test_only_selected_scenarios_are_run_and_counted(settings, capsys):
     run_demo(settings(limit=2))
     assert {r.scenario_id for r in read_trial_log(settings().trial_log)} == {

@@ -187,6 +187,7 @@ def test_a_snapshot_is_not_used_unless_asked_for(simulator, carried):
         assert_exact(hand_off(simulator, scenario, cache=cache))
 
 
+@pytest.mark.nightly
 def test_approximate_snapshots_give_the_handoff_and_drift_alike(simulator, carried, tmp_path):
     """What follows a restored snapshot is not what follows a replay, but the same for all trials."""
     scenario, after = carried

@@ -26,6 +26,12 @@ from tests.support.serve_loop import (  # noqa: F401 - fixtures
 pytestmark = pytest.mark.lerobot
 
 
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    """Pauses between attempts are a thousandth of what they are."""
+    monkeypatch.setattr("lerobot_roborecover.remote.connection._FIRST_DELAY_S", 1e-4)
+
+
 def write_mapping(tmp_path, text=FAKE_MAPPING):
     (tmp_path / "fake.yaml").write_text(text)
     return str(tmp_path / "fake.yaml")

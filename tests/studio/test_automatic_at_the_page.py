@@ -71,7 +71,7 @@ def compare(root: Path, tmp_path: Path, names: list[str]) -> None:
 
 def test_the_page_shows_what_the_steps_say(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    compare(candidate_dataset(tmp_path / "rollouts", 5), tmp_path, ["auto-1"])
+    compare(candidate_dataset(tmp_path / "rollouts", 2), tmp_path, ["auto-1"])
 
 
 def test_every_row_of_the_readout_is_read(tmp_path, monkeypatch):

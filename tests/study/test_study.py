@@ -164,6 +164,7 @@ def test_refusals(study, tmp_path, capsys):
 
 
 @pytest.mark.lerobot
+@pytest.mark.nightly
 def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path, capsys):
     define(study, policies={"act": 1}, interventions=[])
     (study / "policies" / "act" / "config.json").write_text("{}")

@@ -194,6 +194,7 @@ def test_videos_of_chosen_scenarios(run):
     assert all(name.startswith(chosen) for name in found)
 
 
+@pytest.mark.nightly
 def test_without_videos_nothing_is_rendered(run, monkeypatch, tmp_path):
     """Workers are fresh interpreters: a package ahead of ours on their path counts the renders."""
     site = tmp_path / "site"
