@@ -20,6 +20,7 @@ from lerobot_roborecover.curation.attrition import Decision, read_decisions, rec
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.film import Film, read_film
 from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.studio.teleop.hub import Hub
@@ -38,6 +39,7 @@ from lerobot_roborecover.studio.teleop.write import (
 )
 from lerobot_roborecover.studio.web.serve import MAX_SOCKET_MESSAGE_BYTES, listen, make_server
 from tests.support.candidate_files import candidate_dataset
+from tests.support.processes import PATIENCE_S
 from tests.support.teleop_sessions import push
 
 TOKEN = "t" * 32
@@ -318,7 +320,7 @@ class Eyes:
     def read(self, until, seen=True):
         """Takes messages until a status fits or a picture comes; says that pictures were shown."""
         while True:
-            said = self.socket.recv(timeout=60)
+            said = self.socket.recv(timeout=PATIENCE_S)
             if isinstance(said, bytes):
                 self.pictures.append(said)
                 continue
@@ -334,11 +336,20 @@ class Eyes:
         self.socket.send(json.dumps({"type": kind, **values}))
 
 
-def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_path):
+def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_path, monkeypatch):
     starts = [first_state("fake", "push-left", seed=s) for s in (3, 4)]
+    # The first start takes as long to load as the page takes to come.
+    seen, reset = threading.Event(), FakeSimulator.reset
+
+    def slow(simulator, *start):
+        assert seen.wait(PATIENCE_S)
+        reset(simulator, *start)
+
+    monkeypatch.setattr(FakeSimulator, "reset", slow)
     with cockpit(tmp_path / "r", starts) as found:
         eyes = Eyes(found)
         loading = eyes.read(lambda m: m.get("phase") == "loading")
+        seen.set()
         assert loading["instruction"] == starts[0].task.instruction
         assert not eyes.read(lambda m: m.get("phase") == "preview")["under_way"]
         assert eyes.read(lambda m: m["type"] == "shown")["scene"] == eyes.status["scene"]
