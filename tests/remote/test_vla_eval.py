@@ -8,9 +8,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_roborecover.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.remote.errors import (
     MappingError,
     RemoteError,
@@ -20,7 +18,6 @@ from lerobot_roborecover.remote.errors import (
     WireError,
 )
 from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
-from lerobot_roborecover.remote.modeling_remote import RemotePolicy
 from lerobot_roborecover.remote.translate import Translator
 from lerobot_roborecover.remote.vla_eval import pack_message, unpack_message
 from tests.support.policy_servers import vla_eval  # noqa: F401 - a fixture
@@ -106,6 +103,11 @@ def model_server(predict, chunk=None, specs=({}, {}), params=None):
 
 
 def policy(url, mapping, width=2, **options):
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+
     settings = {"wait_s": 1, "reconnect_s": 0.3, "timeout_s": 20, **options}
     features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
     return RemotePolicy(RemoteConfig(url=url, mapping=mapping, output_features=features, **settings))
@@ -266,6 +268,9 @@ def test_what_does_not_fit_is_refused_before_a_simulator_starts(vla_eval, mappin
 
 
 def test_the_protocol_is_the_mappings():
+    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+
     with pytest.raises(RemoteError, match="not one of openpi, vla_eval"):
         RemoteConfig(protocol="zmq")
     assert RemoteConfig(protocol="vla_eval").mapping == "vla_eval_libero"
