@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from lerobot_roborecover.env.command_line import process_arguments, run_with_arguments
-
 pytestmark = pytest.mark.lerobot
 
 
 def test_the_process_has_its_own_arguments_back(monkeypatch):
+    from lerobot_roborecover.env.command_line import process_arguments
+
     held = ["program", "--one"]
     monkeypatch.setattr(sys, "argv", held)
     with process_arguments("roborecover-eval", ("--two=2", "--three")):
@@ -23,6 +23,8 @@ def test_the_process_has_its_own_arguments_back(monkeypatch):
 
 
 def test_lerobots_parser_reads_them():
+    from lerobot_roborecover.env.command_line import run_with_arguments
+
     @dataclass
     class Config:
         steps: int = 1
