@@ -9,16 +9,21 @@ from lerobot.optim.optimizers import OptimizerConfig
 
 from lerobot_roborecover.remote.errors import RemoteError
 
+SCHEMES = {"openpi": ("ws://", "wss://"), "vla_eval": ("ws://", "wss://"), "gr00t": ("tcp://",)}
+"""How an address of each protocol begins."""
+_URL, _GR00T_URL = "ws://127.0.0.1:8000", "tcp://127.0.0.1:5555"
+
 
 @PreTrainedConfig.register_subclass("remote")
 @dataclass
 class RemoteConfig(PreTrainedConfig):
-    """A policy on a server that speaks openpi's protocol."""
+    """A policy on a server that speaks openpi's protocol, vla-eval's, or GR00T's."""
 
-    url: str = "ws://127.0.0.1:8000"
-    """Address of the server: `ws://HOST:PORT`, or `wss://` where a proxy adds TLS."""
+    url: str = _URL
+    """Address of the server: `ws://HOST:PORT`, or `wss://` where a proxy adds TLS; for GR00T's
+    `tcp://HOST:PORT`, by default `tcp://127.0.0.1:5555`."""
     protocol: str = ""
-    """`openpi` or `vla_eval`; empty: the mapping's."""
+    """`openpi`, `vla_eval` or `gr00t`; empty: the mapping's."""
     mapping: str = ""
     """What the server is sent and what it answers: a packaged mapping (`lerobot`, for `roborecover serve`;
     `openpi_libero`; ...) or the path of a YAML file."""
@@ -43,12 +48,15 @@ class RemoteConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         self.device = "cpu"  # what arrives here goes to the network, not to a GPU
         super().__post_init__()
-        if not self.url.startswith(("ws://", "wss://")):
-            raise RemoteError(f"--policy.url={self.url}: write ws://HOST:PORT")
-        if self.protocol not in ("", "openpi", "vla_eval"):
-            raise RemoteError(f"--policy.protocol={self.protocol}: not one of openpi, vla_eval")
-        if self.protocol == "vla_eval" and not self.mapping:
-            self.mapping = "vla_eval_libero"
+        if self.protocol not in ("", *SCHEMES):
+            raise RemoteError(f"--policy.protocol={self.protocol}: not one of {', '.join(SCHEMES)}")
+        if self.protocol in ("vla_eval", "gr00t") and not self.mapping:
+            self.mapping = f"{self.protocol}_libero"
+        if self.protocol == "gr00t" and self.url == _URL:
+            self.url = _GR00T_URL
+        schemes = SCHEMES[self.protocol] if self.protocol else sum(SCHEMES.values(), ())
+        if not self.url.startswith(schemes):
+            raise RemoteError(f"--policy.url={self.url}: write {schemes[0]}HOST:PORT")
         for name, low, high in (
             ("connections", 1, 256),
             ("timeout_s", 0.001, 10**5),

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from websockets.exceptions import (
     ConnectionClosed,
@@ -241,15 +241,16 @@ class RemoteServer:
     options: ServerOptions
     metadata: dict[str, Any] = field(default_factory=dict)
     """The server's own, once it has been reached."""
-    connection_class: ClassVar[type[Connection]] = Connection
+
+    def make_connection(self) -> Connection:
+        """A connection that is not open yet."""
+        return Connection(self.options, self._closing)
 
     def __post_init__(self):
         self._closing = threading.Event()
         self._answered = False
         self._idle: queue.LifoQueue[Connection] = queue.LifoQueue()
-        self._all = [
-            self.connection_class(self.options, self._closing) for _ in range(self.options.connections)
-        ]
+        self._all = [self.make_connection() for _ in range(self.options.connections)]
         for connection in self._all:
             self._idle.put(connection)
         self._threads = ThreadPoolExecutor(self.options.connections, thread_name_prefix="remote")

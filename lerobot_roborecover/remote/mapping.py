@@ -42,6 +42,8 @@ class ImageEntry:
     """`uint8` from 0 to 255, or `float32` from 0 to 1."""
     batch_axis: bool = False
     """Whether the server wants a first axis of length 1."""
+    time_axis: bool = False
+    """Whether the steps of the window are an axis, after the batch's (GR00T)."""
     when: tuple[str, ...] = ()
     """Observation parameters that the server must have asked for: `name`, or `not name` (vla-eval)."""
 
@@ -74,6 +76,8 @@ class StateEntry:
     under: str = ""
     dtype: Literal["float32", "float64"] = "float32"
     batch_axis: bool = False
+    time_axis: bool = False
+    """As of a picture."""
     when: tuple[str, ...] = ()
     """As of a picture."""
 
@@ -87,19 +91,23 @@ class Prompt:
     """Where the instruction goes."""
 
     key: str = "prompt"
+    under: str = ""
+    """Key of the map that holds it."""
     as_list: bool = False
     """Whether the server wants a list of one string."""
+    batch_axis: bool = False
+    """Whether it wants that in a list again."""
     lower: bool = False
 
 
 @dataclass(frozen=True)
 class Window:
-    """Observations of the last steps, sent as a list of maps, oldest first; the first one of a trial is
-    repeated until there are enough."""
+    """Observations of the last steps, oldest first; the first one of a trial is repeated until there are
+    enough."""
 
     frames: int
-    key: str
-    """The list's key; pictures and states go into its maps."""
+    key: str = ""
+    """Key of a list of maps, into which pictures and states go; empty: they are the entries' time axis."""
 
     def __post_init__(self):
         if not 1 <= self.frames <= 64:
@@ -188,8 +196,10 @@ class Mapping:
     """Of this format."""
     about: str
     """What the mapping speaks to, in a line."""
-    protocol: Literal["openpi", "vla_eval"] = "openpi"
+    protocol: Literal["openpi", "vla_eval", "gr00t"] = "openpi"
     """How the server is spoken to."""
+    argument: str = "observation"
+    """Under which name `get_action` takes the observation; empty: it takes nothing else (GR00T N1.5)."""
     specs: Specs = field(default_factory=Specs)
     """Compared with what the server declares (vla-eval)."""
     episode: dict[str, Any] = field(default_factory=dict)
@@ -217,9 +227,18 @@ class Mapping:
             raise MappingError("sends nothing: give images or state (or native: true for roborecover serve)")
         if self.protocol == "vla_eval" and (self.native or self.window or self.reset):
             raise MappingError("protocol: vla_eval takes no native, window or reset")
+        if self.protocol == "gr00t" and self.native:
+            raise MappingError("protocol: gr00t takes no native")
+        timed = [e.key for e in (*self.images, *self.state) if e.time_axis]
+        if self.window and bool(self.window.key) == bool(timed):
+            raise MappingError(
+                "window: give its key, for a list of maps, or the time_axis of the pictures and states"
+            )
         keys = [(e.under, e.key, *e.when) for e in (*self.images, *self.state)]
         keys += [("", k) for k in self.constants]
-        keys += [("", self.prompt.key)] + ([("", self.window.key)] if self.window else [])
+        keys += [(self.prompt.under, self.prompt.key)] + (
+            [("", self.window.key)] if self.window and self.window.key else []
+        )
         twice = sorted({"/".join(filter(None, k[:2])) for k in keys if keys.count(k) > 1})
         if twice:
             raise MappingError(f"server keys given twice: {twice}")

@@ -1,4 +1,4 @@
-"""The `remote` policy type: action chunks from a server that speaks openpi's protocol.
+"""The `remote` policy type: action chunks from a server that speaks openpi's protocol, or one of two others.
 
 A request is made per slot, and the requests of a batch travel at once. Each slot keeps what it needs of its
 trial in a `RemoteTrial`: actions not executed yet, the observations of the mapping's window, and the session
@@ -25,13 +25,14 @@ from torch import Tensor, nn
 
 from lerobot_roborecover.policies.host import Processor
 from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-from lerobot_roborecover.remote.connection import RemoteServer, Request, ServerOptions
+from lerobot_roborecover.remote.connection import Request
 from lerobot_roborecover.remote.errors import MappingError, RemoteError, ServerAwayError, SessionGoneError
-from lerobot_roborecover.remote.keys import api_key
 from lerobot_roborecover.remote.mapping import load_mapping
+from lerobot_roborecover.remote.modalities import check_modalities
+from lerobot_roborecover.remote.servers import make_server
 from lerobot_roborecover.remote.sessions import ENVELOPE, PROTOCOL
 from lerobot_roborecover.remote.translate import Translator
-from lerobot_roborecover.remote.vla_eval import EpisodeServer, check_specs, wanted
+from lerobot_roborecover.remote.vla_eval import check_specs, wanted
 
 if TYPE_CHECKING:
     from lerobot_roborecover.remote.host import RemoteHost
@@ -81,24 +82,8 @@ class RemotePolicy(PreTrainedPolicy):
         self.translator = Translator(mapping, config.n_action_steps, width)
         self.native = mapping.native
         self._reset_message = mapping.reset.message if mapping.reset else None
-        if config.protocol not in ("", mapping.protocol):
-            raise MappingError(
-                f"--policy.mapping={config.mapping} is for {mapping.protocol}; --policy.protocol="
-                f"{config.protocol} needs one of its own"
-            )
         self._pinned = mapping.protocol == "vla_eval"
-        self.server = (EpisodeServer if self._pinned else RemoteServer)(
-            ServerOptions(
-                config.url,
-                timeout_s=config.timeout_s,
-                wait_s=config.wait_s,
-                reconnect_s=config.reconnect_s,
-                connections=config.connections,
-                max_frame_bytes=config.max_frame_mb * 2**20,
-                api_key=api_key(),
-                greeting=mapping.episode if self._pinned else self._reset_message,
-            )
-        )
+        self.server = make_server(config, mapping)
         weakref.finalize(self, self.server.close)
         self._client, self._numbers = uuid.uuid4().hex, count()
         self._slots: list[RemoteTrial] | None = None
@@ -111,6 +96,8 @@ class RemotePolicy(PreTrainedPolicy):
             if self._pinned:
                 check_specs(metadata, mapping.specs, width, config.url)
                 self.translator.flags = wanted(metadata)
+            if mapping.protocol == "gr00t":
+                check_modalities(metadata, mapping, self.translator.execute, config.url)
         except RemoteError:
             self.server.close()
             raise
@@ -268,7 +255,7 @@ class RemotePolicy(PreTrainedPolicy):
         for slot, task, index in zip(slots, tasks, indices, strict=True):
             if self.translator.frames == 1 or not slot.frames:
                 self._see(slot, observations[index])
-            payload = self.translator.request(slot.frames, task)
+            payload = self._payload(slot, task)
             if self.native:
                 payload[ENVELOPE] = {"session": slot.session, "seed": slot.seed, "step": slot.step}
             prelude = None if slot.step else self._reset_message
@@ -277,6 +264,13 @@ class RemotePolicy(PreTrainedPolicy):
         answers = self.server.ask(requests)
         self._count_outage(answers)
         return [self._actions(slot, answer) for slot, answer in zip(slots, answers, strict=True)]
+
+    def _payload(self, slot: RemoteTrial, task: str) -> dict[str, Any]:
+        payload = self.translator.request(slot.frames, task)
+        mapping = self.translator.mapping
+        if mapping.protocol == "gr00t" and mapping.argument:
+            return {mapping.argument: payload}
+        return payload
 
     def _see(self, slot: RemoteTrial, observation: Mapping[str, np.ndarray]) -> None:
         if not self._checked:

@@ -64,8 +64,24 @@ class Translator:
         """
         window, prompt = self.mapping.window, self.mapping.prompt
         text = task.lower() if prompt.lower else task
-        out = {window.key: list(frames)} if window else dict(frames[-1])
-        return {**out, **self.mapping.constants, prompt.key: [text] if prompt.as_list else text}
+        if window:
+            out = {window.key: list(frames)} if window.key else self._stacked(frames)
+        else:
+            out = {k: dict(v) if isinstance(v, dict) else v for k, v in frames[-1].items()}
+        out |= self.mapping.constants
+        worded: Any = [text] if prompt.as_list else text
+        _put(out, prompt.under, prompt.key, [worded] if prompt.batch_axis else worded)
+        return out
+
+    def _stacked(self, frames: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """One map of all frames, which follow each other along the time axes."""
+        out: dict[str, Any] = {}
+        for entry in (*self.mapping.images, *self.mapping.state):
+            if holds(entry.when, self.flags):
+                parts = [(f[entry.under] if entry.under else f)[entry.key] for f in frames]
+                whole = np.concatenate(parts, axis=int(entry.batch_axis)) if entry.time_axis else parts[-1]
+                _put(out, entry.under, entry.key, whole)
+        return out
 
     def actions(self, answer: Any) -> np.ndarray:
         """(n, A) float32 actions to execute.
@@ -200,7 +216,7 @@ _CONVERSIONS = {
 }  # fmt: skip
 
 
-def _put(out: dict[str, Any], under: str, key: str, value: np.ndarray) -> None:
+def _put(out: dict[str, Any], under: str, key: str, value: Any) -> None:
     (out.setdefault(under, {}) if under else out)[key] = value
 
 
@@ -236,7 +252,7 @@ def _picture(entry: ImageEntry, observation: Map[str, np.ndarray]) -> np.ndarray
         picture = picture.transpose(2, 0, 1)
     if entry.dtype == "float32":
         picture = picture.astype(np.float32) / 255
-    return np.ascontiguousarray(picture[None] if entry.batch_axis else picture)
+    return np.ascontiguousarray(_with_axes(entry, picture))
 
 
 def _vector(entry: StateEntry, observation: Map[str, np.ndarray]) -> np.ndarray:
@@ -251,7 +267,11 @@ def _vector(entry: StateEntry, observation: Map[str, np.ndarray]) -> np.ndarray:
         vector = vector[slice(*part.slice)] if part.slice is not None else vector
         parts.append(_CONVERSIONS[part.convert](vector))
     whole = np.concatenate(parts).astype(entry.dtype)
-    return whole[None] if entry.batch_axis else whole
+    return _with_axes(entry, whole)
+
+
+def _with_axes(entry: ImageEntry | StateEntry, value: np.ndarray) -> np.ndarray:
+    return value.reshape((1,) * (entry.batch_axis + entry.time_axis) + value.shape)
 
 
 def _native(key: str, value: np.ndarray) -> np.ndarray:

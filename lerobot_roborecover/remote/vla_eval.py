@@ -211,7 +211,9 @@ def _one_action(payload: Any) -> np.ndarray:
 class EpisodeServer(RemoteServer):
     """A server as several episodes see it, each pinned to a connection of its own."""
 
-    connection_class = EpisodeConnection
+    def make_connection(self) -> Connection:
+        """A connection that is not open yet."""
+        return EpisodeConnection(self.options, self._closing)
 
     def __post_init__(self):
         super().__post_init__()
@@ -252,7 +254,7 @@ class EpisodeServer(RemoteServer):
         try:
             found = self._idle.get_nowait()
         except queue.Empty:
-            found = EpisodeConnection(self.options, self._closing)
+            found = self.make_connection()
             self._all.append(found)
         assert isinstance(found, EpisodeConnection)
         return found

@@ -149,8 +149,8 @@ def test_a_mapping_is_found_by_name_or_path(tmp_path):
     with pytest.raises(MappingError, match=r"openpy.*openpi_libero"):
         load_mapping("openpy")
     assert packaged_mappings() == [
-        "being_h05", "cosmos_policy", "lerobot", "lingbot_vla", "openpi_libero", "unifolm_vla",
-        "vla_eval_libero",
+        "being_h05", "cosmos_policy", "gr00t_libero", "lerobot", "lingbot_vla", "openpi_libero",
+        "unifolm_vla", "vla_eval_libero",
     ]  # fmt: skip
 
 
