@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -21,13 +19,13 @@ from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
 from lerobot_roborecover.remote.translate import Translator
 from lerobot_roborecover.remote.vla_eval import pack_message, unpack_message
 from tests.support.policy_servers import vla_eval  # noqa: F401 - a fixture
-from tests.support.processes import PATIENCE_S
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
     TRIALS,
     dataset,
     evaluate,
     remote,
 )
+from tests.support.vla_eval_server import model_server
 
 pytestmark = pytest.mark.lerobot
 
@@ -46,60 +44,6 @@ actions: {execute: 1}
 def mapping(tmp_path):
     (tmp_path / "fake.yaml").write_text(MAPPING)
     return str(tmp_path / "fake.yaml")
-
-
-@contextmanager
-def model_server(predict, chunk=None, specs=({}, {}), params=None):
-    """The package's server around a function of an observation; yields its address and what it was told."""
-    import anyio
-    from vla_eval.model_servers.predict import PredictModelServer
-    from vla_eval.model_servers.serve import serve_async
-    from vla_eval.specs import DimSpec
-
-    told: list = []
-
-    class Model(PredictModelServer):
-        def predict(self, obs, ctx):
-            told.append(("observation", obs))
-            return {"actions": predict(obs)}
-
-        async def on_episode_start(self, config, ctx):
-            told.append(("start", config))
-            self._chunk_buffers.pop(ctx.session_id, None)
-
-        async def on_episode_end(self, result, ctx):
-            told.append(("end", result))
-
-        def get_action_spec(self):
-            return {k: DimSpec(k, *v) for k, v in specs[0].items()}
-
-        def get_observation_spec(self):
-            return {k: DimSpec(k, *v) for k, v in specs[1].items()}
-
-        def get_observation_params(self):
-            return params or {}
-
-    up, found = threading.Event(), []
-
-    async def run():
-        async with anyio.create_task_group() as group:
-            found.append(await group.start(serve_async, Model(chunk_size=chunk), "127.0.0.1", 0))
-            found.append(group.cancel_scope)
-            up.set()
-
-    async def whole():
-        found.append(anyio.lowlevel.current_token())
-        await run()
-
-    thread = threading.Thread(target=lambda: anyio.run(whole), daemon=True)
-    thread.start()
-    assert up.wait(PATIENCE_S)
-    token, port, scope = found
-    try:
-        yield f"ws://127.0.0.1:{port}", told
-    finally:
-        anyio.from_thread.run_sync(scope.cancel, token=token)
-        thread.join(PATIENCE_S)
 
 
 def policy(url, mapping, width=2, **options):

@@ -22,6 +22,7 @@ from tests.support.processes import PATIENCE_S
 
 OPENPI_CLIENT = "openpi-client==0.1.2"
 VLA_EVAL = "vla-eval==0.8.0"
+LAZY_REGISTRY = "lazyregistry==0.4.0"
 ROOT = Path(__file__).parents[2]
 
 
@@ -124,6 +125,13 @@ def openpi_client(tmp_path_factory) -> Any:
 def vla_eval(tmp_path_factory) -> Any:
     """The real `vla_eval`, likewise: its harness asks for packages that its servers do without."""
     return _installed("vla_eval", VLA_EVAL, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def vla_eval_harness(vla_eval, tmp_path_factory) -> Any:
+    """`vla_eval`, with what its orchestrator imports beside LeRobot's packages."""
+    _installed("lazyregistry", LAZY_REGISTRY, tmp_path_factory)
+    return vla_eval
 
 
 def _installed(module: str, requirement: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
