@@ -82,6 +82,11 @@ class RecoveryBenchmark(StepBenchmark):
                 "vla_eval, which executes one action an observation"
             )
         options = draccus.decode(env_type(platform), dict(env or {}))
+        if options.realtime:
+            raise RoboRecoverError(
+                "env realtime=true: the harness waits for the model; use roborecover eval with "
+                "--policy.protocol=vla_eval"
+            )
         if trial_log:
             options.trial_log = trial_log.format(pid=os.getpid())
         facts = RunFacts(policy=policy, policy_type="vla_eval", execution_horizon=1)

@@ -21,7 +21,7 @@ from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
-from lerobot_roborecover.analysis.logs import Arm, arm_of, stopped
+from lerobot_roborecover.analysis.logs import Arm, arm_of, clock_of, stopped
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.resampling import resample
@@ -191,6 +191,7 @@ def _board_key(row: TrialRow) -> tuple:
     revision = f"@{row.dataset_revision}" if row.dataset_revision else ""
     kind = "" if row.options.get("handoff_check", True) else ", handoff not checked"
     kind += ", approximate snapshots" if row.options.get("approximate_snapshots") else ""
+    kind += f", {clock}" if (clock := clock_of(row)) else ""
     return row.platform, f"{row.dataset}{revision}", row.split, simulators, kind
 
 

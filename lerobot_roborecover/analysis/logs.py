@@ -144,6 +144,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     _check_options(kept)
     remarks += _revisions(kept, found)
     remarks += _render_qualities(kept)
+    remarks += _clocks(kept)
     remarks += _check_versions(kept)
     _check_runs(kept, runs, run_of)
     arms = stopped(_arms(kept, runs, run_of), records)
@@ -281,6 +282,27 @@ def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
         return []
     text = ", ".join(f"{quality} ({policy})" for quality, policy in sorted(users.items()))
     return [f"the render quality differs between trials, and may move scores: {text}"]
+
+
+def clock_of(row: TrialRow) -> str:
+    """How a trial's time went on while its policy thought, in words; empty where it stood still."""
+    meanwhile = row.options.get("realtime")
+    if not meanwhile:
+        return ""
+    latency = row.options.get("latency_s")
+    what = f"{latency:g} s an inference" if isinstance(latency, int | float) else "inferences as measured"
+    return f"real time ({what}, {meanwhile})"
+
+
+def _clocks(rows: Sequence[TrialRow]) -> list[str]:
+    """A remark where time stood still for some policies only, or went on otherwise."""
+    users: dict[str, str] = {}
+    for row in _apart(rows, "options"):
+        users.setdefault(clock_of(row) or "frozen clock", row.policy)
+    if len(users) < 2:
+        return []
+    text = "; ".join(f"{clock} ({policy})" for clock, policy in sorted(users.items()))
+    return [f"time did not go on alike while policies thought: {text}"]
 
 
 def _check_versions(rows: Sequence[TrialRow]) -> list[str]:

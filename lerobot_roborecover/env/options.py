@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_roborecover.env.real_time import MEANWHILE
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import Start
 
@@ -50,6 +51,13 @@ class RecoveryOptions:
     """Folder that keeps handoff snapshots between runs; empty shares them within the run alone."""
     videos: bool = False
     """Render frames for LeRobot's videos also where the observation has no pixels."""
+    realtime: bool = False
+    """The simulator runs on while the policy thinks: an inference costs control steps, which count."""
+    latency_s: float | None = None
+    """Seconds that an inference is taken to last, with `realtime`; None charges what each has taken."""
+    meanwhile: str = "hold"
+    """What is executed while the policy thinks, with `realtime`: `hold` repeats the last action, `chunk`
+    goes on with the last chunk."""
 
     def check(self) -> None:
         """Checks what can be checked without scenarios.
@@ -65,6 +73,12 @@ class RecoveryOptions:
             raise OptionError(f"--env.rewind_steps={self.rewind_steps}: a step count from 0 to 100000")
         if not 0 < self.watchdog_s < 86_400:
             raise OptionError(f"--env.watchdog_s={self.watchdog_s}: seconds, above 0 and below a day")
+        if self.meanwhile not in MEANWHILE:
+            raise OptionError(f"--env.meanwhile={self.meanwhile}: not one of {list(MEANWHILE)}")
+        if self.latency_s is not None and not 0 <= self.latency_s <= 600:
+            raise OptionError(f"--env.latency_s={self.latency_s}: seconds from 0 to 600")
+        if not self.realtime and (self.latency_s is not None or self.meanwhile != "hold"):
+            raise OptionError("--env.latency_s and --env.meanwhile are charged with --env.realtime=true only")
         self.shard_of()
 
     def shard_of(self) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from lerobot_roborecover.datasets.load import validate_for
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
+from lerobot_roborecover.env.real_time import RealTime
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow, check_retry
 from lerobot_roborecover.platforms import platform_named
@@ -68,6 +69,8 @@ class Run:
     simulator."""
     intervention: InterventionFacts | None = None
     """Of a composite policy."""
+    real_time: RealTime | None = None
+    """None where the simulator waits for the policy."""
 
     def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
@@ -123,6 +126,7 @@ class Run:
             action_width=self.action_width(scenario),
             handoff_check=self.handoff_check,
             rollback_steps=self.rollback_steps(scenario),
+            real_time=self.real_time,
         )
 
     def record(self, trial: Trial, *, noise: str, batch_size: int) -> TrialRow:
@@ -170,6 +174,9 @@ def open_run(
     if facts.intervention is not None:
         _check_intervention(facts.intervention, start)
         decisive |= facts.intervention.options()
+    real_time = _real_time(options, facts)
+    if real_time is not None:
+        decisive |= real_time.decisive()
     protocol = Protocol(
         start=start.value,
         rewind_steps=options.rewind_steps if start is Start.REVERSION else 0,
@@ -205,8 +212,25 @@ def open_run(
         n_trials=facts.n_episodes,
         picture=spec.picture,
         intervention=facts.intervention,
+        real_time=real_time,
     )
     return scenarios, run
+
+
+def _real_time(options: RecoveryOptions, facts: RunFacts) -> RealTime | None:
+    if not options.realtime:
+        return None
+    if facts.intervention is not None:
+        raise OptionError(
+            f"--env.realtime=true with --policy.mode={facts.intervention.mode}: interventions take the "
+            "frozen clock; leave one of the two out"
+        )
+    if facts.execution_horizon is None:
+        raise OptionError(
+            "--env.realtime=true charges inferences, and nothing says how many actions one gives: name "
+            "--policy.n_action_steps"
+        )
+    return RealTime(options.meanwhile, options.latency_s, facts.execution_horizon)
 
 
 def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:

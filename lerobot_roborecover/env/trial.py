@@ -12,7 +12,8 @@
 
 `skip` and `fail` end a trial from wherever it is. Pure: no clock, no process, no file. Two loops drive it:
 `env.vector_env` for LeRobot's, one action at a time, and `trials.engine` for ours, chunk by chunk; the same
-policy gives the same row in both, because a chunk counts as its actions one by one.
+policy gives the same row in both, because a chunk counts as its actions one by one. Where the clock does not
+stop (`real_time`), `decide` puts what was executed while the policy thought before its actions.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.intervention_record import InterventionRecord
+from lerobot_roborecover.env.real_time import MovingClock, RealTime
 from lerobot_roborecover.env.trial_log import Protocol, TrialRow, make_row, trial_key, trial_seed
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
@@ -94,6 +96,7 @@ class Trial:
         action_width: A, values in the policy's action.
         handoff_check: compare the handoff with the scenario's fingerprint.
         rollback_steps: how far back the policy may ask to go.
+        real_time: what an inference costs; None: the simulator waits.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class Trial:
         action_width: int,
         handoff_check: bool = True,
         rollback_steps: int = 0,
+        real_time: RealTime | None = None,
     ):
         self.scenario, self.index, self.protocol = scenario, index, protocol
         self.state = TrialState.NEW
@@ -121,6 +125,8 @@ class Trial:
         self._sim_s = self._policy_s = 0.0
         self._executed = hashlib.sha256()
         self._record = InterventionRecord()
+        self._real_time = real_time
+        self._clock: MovingClock | None = None
         self._sent = np.empty((0, action_width))
         self._directives: Sequence[Directive] = ()
 
@@ -185,6 +191,8 @@ class Trial:
         """
         self._leave(TrialState.ASKED, to=TrialState.ACTING)
         self._policy_s += seconds
+        if self._clock is not None:
+            actions = self._clock.sequence(actions, seconds)
         self._sent, self._directives = actions, directives or ()
         if self._directives:
             first = self._directives[0]
@@ -220,6 +228,8 @@ class Trial:
         elif isinstance(reply, EpisodeStart):
             self._leave(TrialState.HANDING_OFF, to=TrialState.WAITING)
             self.observation, self.handoff = reply.observation, reply.handoff
+            if self._real_time is not None:
+                self._clock = MovingClock(self._real_time, reply.hz)
             if reply.handoff.problem is not None:
                 self._end(reply.handoff.problem, reply.handoff.reason)
         elif isinstance(reply, RollbackResult):

@@ -27,7 +27,7 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.options import RecoveryOptions
+from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, Run, open_run, scenario_group
 from lerobot_roborecover.env.trial import Act, Trial, TrialState
 from lerobot_roborecover.env.trial_log import Protocol, trial_seed
@@ -136,8 +136,12 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
             if move is None:
                 self._record_if_over(trial)
                 continue
-            command = ("step", move.actions[0]) if isinstance(move, Act) else ("rollback", move.steps)
-            slots[index].send(*command)
+            if not isinstance(move, Act):
+                slots[index].send("rollback", move.steps)
+            elif len(move.actions) == 1:
+                slots[index].send("step", move.actions[0])
+            else:  # the policy thought, and time went on
+                slots[index].send("act", move.actions)
             working.append(index)
         for index in working:
             self._trials[index].take(slots[index].receive())
@@ -266,6 +270,11 @@ def create_recovery_envs(
     Raises:
         OptionError, ScenarioError, TrialLogError: see `open_run`.
     """
+    if options.realtime and options.meanwhile == "chunk":
+        raise OptionError(
+            "--env.meanwhile=chunk: LeRobot's loop hands actions over one by one, so that none is at hand "
+            "while the policy thinks. Use roborecover eval, or --env.meanwhile=hold"
+        )
     scenarios, run = open_run(options, spec, workers=workers, facts=facts)
     envs: dict[str, dict[str, ScenarioVectorEnv]] = {}
     for scenario in sorted(scenarios, key=lambda s: (s.task.suite, s.task.name, s.id)):

@@ -1,0 +1,144 @@
+"""RSR against latency: trials of the same policy whose inferences were given different lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from lerobot_roborecover.analysis.estimators import RowsError, rsr, scenario_rates
+from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
+from lerobot_roborecover.analysis.style import (
+    LINE,
+    Figure,
+    Plot,
+    Width,
+    both,
+    colour,
+    dash,
+    drawing,
+    marker,
+    short,
+)
+from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.scenario import Start
+
+MEASURED = float("nan")
+"""Latency of trials that were charged what each inference took."""
+
+
+@dataclass(frozen=True)
+class LatencyRate:
+    """One policy at one latency."""
+
+    policy: str
+    meanwhile: str
+    """`hold` or `chunk`; empty with a frozen clock."""
+    latency_s: float
+    """0 with a frozen clock; NaN where it was measured."""
+    scenarios: int
+    trials: int
+    invalid: int
+    rate: Estimate
+    """RSR, in [0, 1]."""
+
+
+def latency_rates(rows: Iterable[TrialRow], level: float = LEVEL) -> list[LatencyRate]:
+    """Rates from recovery points, by policy, what went on meanwhile, and latency.
+
+    Args:
+        rows: of one log or several.
+        level: of the intervals.
+
+    Raises:
+        RowsError: no such trials; or the latencies of a policy were run on different scenarios.
+    """
+    groups: dict[tuple[str, str, float], list[TrialRow]] = {}
+    for row in rows:
+        if row.start == Start.RECOVERY and not row.interventions:
+            groups.setdefault(_key(row), []).append(row)
+    if not groups:
+        raise RowsError("no trials from recovery points: give logs of --env.start=recovery")
+    found, seen = [], {}
+    for key in sorted(groups, key=lambda k: (k[0], k[1], np.nan_to_num(k[2], nan=np.inf))):
+        rates = scenario_rates([asdict(row) for row in groups[key]])
+        before = seen.setdefault(key[0], rates.ids)
+        if set(before) != set(rates.ids):
+            odd = sorted(set(before) ^ set(rates.ids))
+            raise RowsError(
+                f"{key[0]} was run on {len(rates.ids)} scenarios at {_words(key)} and on {len(before)} at "
+                f"another latency ({odd[0]} is one of {len(odd)} that differ): run all latencies on the same"
+            )
+        bounds = rate_interval(spread(rates.rates, rates.units), level)
+        trials, invalid = int(rates.trials.sum()), int(rates.invalid.sum())
+        estimate = estimate_of(rsr(rates.rates), bounds)
+        found.append(LatencyRate(*key, len(rates.ids), trials, invalid, estimate))
+    return found
+
+
+def _key(row: TrialRow) -> tuple[str, str, float]:
+    meanwhile, latency = row.options.get("realtime"), row.options.get("latency_s")
+    if not meanwhile:
+        return row.policy, "", 0.0
+    return row.policy, str(meanwhile), float(latency) if isinstance(latency, int | float) else MEASURED
+
+
+def _words(key: tuple[str, str, float]) -> str:
+    _, meanwhile, latency_s = key
+    if not meanwhile:
+        return "a frozen clock"
+    return f"{'measured latency' if np.isnan(latency_s) else f'{latency_s:g} s'} ({meanwhile})"
+
+
+def latency_table(rates: Sequence[LatencyRate], level: float = LEVEL) -> Table:
+    """The figure's numbers."""
+    columns = (
+        Column("Policy"), Column("Inference"), Column("Scenarios", "count"), Column("Trials", "count"),
+        Column("Invalid", "count"), Column("RSR %", "percent"),
+    )  # fmt: skip
+    rows = tuple(
+        (r.policy, _words((r.policy, r.meanwhile, r.latency_s)), r.scenarios, r.trials, r.invalid, r.rate)
+        for r in rates
+    )
+    notes = (f"Intervals: {100 * level:g} %. hold repeats the last action meanwhile, chunk goes on with it.",)
+    return Table("latency", "RSR against latency", columns, rows, notes)
+
+
+def latency_figure(rates: Sequence[LatencyRate], level: float = LEVEL) -> Figure:
+    """RSR against the latency charged; frozen clocks stand at 0, measured ones are in the table alone."""
+    curves: dict[tuple[str, str], list[LatencyRate]] = {}
+    for rate in rates:
+        if rate.meanwhile and not np.isnan(rate.latency_s):
+            curves.setdefault((rate.policy, rate.meanwhile), []).append(rate)
+    for (policy, _), points in curves.items():
+        if all(p.latency_s for p in points):
+            points[:0] = [r for r in rates if r.policy == policy and not r.meanwhile]
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 3.4 + 0.24 * len(curves) if width.narrow else 4.2)
+            for k, ((policy, meanwhile), points) in enumerate(curves.items()):
+                x = 1e3 * np.array([p.latency_s for p in points])
+                y = 100 * np.array([[p.rate.value, p.rate.low, p.rate.high] for p in points])
+                name = f"{short(policy, width.names)}, {meanwhile}"
+                style = {"color": colour(k), "ls": dash(k), "marker": marker(k)}
+                axes.plot(x, y[:, 0], lw=2, label=name, **style)
+                axes.fill_between(x, y[:, 1], y[:, 2], color=colour(k), alpha=0.12, lw=0)
+            axes.set(
+                ylim=(0, 100),
+                xlabel="latency of an inference, ms",
+                ylabel=f"RSR, %, {100 * level:g} % interval",
+            )
+            axes.set_xlim(left=0)
+            axes.grid(color=LINE, lw=0.6)
+            plot.legend(loc="outside lower left" if width.narrow else "outside right upper")
+        return plot
+
+    words = "; ".join(
+        f"{policy} ({meanwhile}) "
+        + ", ".join(f"{100 * p.rate.value:.1f} at {1e3 * p.latency_s:g} ms" for p in points)
+        for (policy, meanwhile), points in curves.items()
+    )
+    return Figure("latency", "RSR against latency", f"RSR in per cent: {words}.", *both(draw))
