@@ -144,8 +144,8 @@ def test_train_save_resume_and_reload(kind, trained, tmp_path, request):
     assert reward.tolist() == together.triggers.astype(float).tolist()
 
 
-@pytest.mark.nightly
-def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(data, base):
+def qwen_monitor(base: Path, **settings):
+    """In training, with adapters that are not zero."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
 
@@ -157,8 +157,8 @@ def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(data, base):
     )
 
     config = RoboRecoverMonitorConfig(
-        base_model=str(base), device="cpu", dtype="float32", lora_dropout=0.0, gradient_checkpointing=False,
-        input_features={CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))},
+        base_model=str(base), device="cpu", dtype="float32", lora_dropout=0.0,
+        input_features={CAMERA: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}, **settings,
     )  # fmt: skip
     model = RoboRecoverMonitorRewardModel(config).train()
     torch.manual_seed(1)
@@ -169,6 +169,51 @@ def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(data, base):
         CAMERA: torch.rand(5, 3, 64, 64), "task": ["a", "another task", "b", "c", "d"],
         "next.reward": torch.tensor([0.0, 1, 1, 0, 1]),
     }  # fmt: skip
+    return model, batch
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_a_piece_is_seen_once_and_its_gradient_is_right(base, checkpointing):
+    """The frozen vision encoder runs once a piece, the language model once, or twice with checkpoints; loss
+    and gradient are those of the whole batch at once."""
+    import torch
+
+    model, batch = qwen_monitor(base, gradient_checkpointing=checkpointing)
+    inner, passes = model.model.get_base_model().model, {"vision": 0, "language": 0}
+
+    def count(name):
+        return lambda *_: passes.__setitem__(name, passes[name] + 1)
+
+    inner.visual.blocks[0].attn.register_forward_hook(count("vision"))
+    inner.language_model.layers[0].self_attn.register_forward_hook(count("language"))
+
+    def step(size, scale=1.0):
+        model.config.micro_batch_size = size
+        model.zero_grad()
+        passes.update(vision=0, language=0)
+        loss, said = model.forward(batch)
+        (scale * loss).backward()
+        return loss.item(), [p.grad.clone() for p in model.get_optim_params()], said
+
+    loss, whole, said = step(5)
+    again, pieces, same = step(2)
+    assert passes == {"vision": 3, "language": 3 * (1 + checkpointing)}
+    assert again == pytest.approx(loss, rel=1e-5)
+    assert same == said
+    assert max(g.abs().max() for g in whole) > 0.01
+    for a, b, scaled in zip(whole, pieces, step(2, 3.0)[1], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(3 * b, scaled)
+    with torch.no_grad():
+        assert model.forward(batch)[0].item() == pytest.approx(loss, rel=1e-5)
+
+
+@pytest.mark.nightly
+def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(base):
+    import torch
+
+    model, batch = qwen_monitor(base, gradient_checkpointing=False)
+    config = model.config
 
     def gradient(size: int, checkpointing: bool) -> tuple[float, list[torch.Tensor]]:
         config.micro_batch_size = size

@@ -48,7 +48,8 @@ class RoboRecoverMonitorConfig(RewardModelConfig):
     """Frames in memory at once during training. A batch is worked off in pieces of this size, so that
     `--batch_size=32` is the paper's 4 frames with gradients accumulated over 8 pieces."""
     gradient_checkpointing: bool = True
-    """Keep only each layer's input and compute the rest again, beside what the pieces save already."""
+    """Keep only each layer's input and compute the rest again: less memory for a piece, and another forward
+    pass of the language model."""
     dtype: str = "bfloat16"
     """Of the base's weights and the arithmetic; adapters are float32."""
     attention: str = "sdpa"

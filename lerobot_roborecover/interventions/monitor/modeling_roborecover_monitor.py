@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,7 +13,6 @@ import torch
 from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from lerobot_roborecover.interventions.monitor.base import TASK, Answers, MonitorRewardModel
 from lerobot_roborecover.interventions.monitor.configuration_roborecover_monitor import (
@@ -27,6 +26,21 @@ logger = logging.getLogger(__name__)
 ADAPTER_FILE, ADAPTER_CONFIG_FILE = "adapter_model.safetensors", "adapter_config.json"
 """peft's names, so that the adapters can be merged and served by other tools."""
 ANSWERS = ("0", "1")
+
+
+class _WithGradients(torch.autograd.Function):
+    """A loss whose gradients are known already."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: Tensor, gradients: Sequence[Tensor], *parameters: Tensor) -> Tensor:
+        """The loss; `gradients` are its derivatives by the parameters."""
+        ctx.gradients = gradients
+        return loss.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor | None, ...]:
+        """The parameters' gradients, times what the loss was scaled by."""
+        return None, None, *(g * outer[0] for g in ctx.gradients)
 
 
 class RoboRecoverMonitorRewardModel(MonitorRewardModel):
@@ -91,27 +105,36 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
         """Cross-entropy of the answer over the whole vocabulary, mean over the batch.
 
-        The batch is worked off in pieces of `micro_batch_size`. Each piece is checkpointed as a whole: the
-        forward pass keeps none of its activations, and `backward` computes them again, piece by piece. So
-        memory is that of one piece, and the gradient is the whole batch's, from one `backward`: all that
-        LeRobot's training loop calls.
+        The batch is worked off in pieces of `micro_batch_size`. In training each piece's gradient is worked
+        out here, as soon as its loss is there, and `backward` hands out their sum. So memory is that of one
+        piece, nothing is computed twice but what `gradient_checkpointing` asks for, and the gradient is the
+        whole batch's, from one `backward`: all that LeRobot's training loop calls.
         """
         labels = self.labels(batch)
         count = len(labels)
         size = self.config.micro_batch_size
         total = torch.zeros((), device=self._device)
+        in_pieces = self.training and torch.is_grad_enabled() and count > size
+        adapters, gradients = self.get_optim_params(), None
         right = unreadable = 0
         for start in range(0, count, size):
             rows = slice(start, start + size)
             inputs = self._inputs(batch, rows)
             targets = torch.tensor([self.answer_ids[int(v)] for v in labels[rows]], device=self._device)
-            if self.training and torch.is_grad_enabled() and count > size:
-                loss, best = checkpoint(self._piece, inputs, targets, use_reentrant=False)
-            else:
-                loss, best = self._piece(inputs, targets)
-            total = total + loss / count
+            loss, best = self._piece(inputs, targets)
+            loss = loss / count
+            if in_pieces:
+                with torch.autocast(self._device.type, enabled=False):  # the caller's is for forward passes
+                    found = torch.autograd.grad(loss, adapters)
+                gradients = (
+                    found if gradients is None else [a + b for a, b in zip(gradients, found, strict=True)]
+                )
+                loss = loss.detach()
+            total = total + loss
             right += int((best == targets).sum())
             unreadable += int((~torch.isin(best, torch.tensor(self.answer_ids, device=self._device))).sum())
+        if gradients is not None:
+            total = _WithGradients.apply(total, gradients, *adapters)
         return total, {
             "accuracy": right / count, "unparsed": unreadable / count, "positives": labels.mean().item(),
         }  # fmt: skip
