@@ -59,15 +59,18 @@ def run(arguments, tmp_path):
 @pytest.fixture(scope="module")
 def whole(dataset, policy, tmp_path_factory):
     """The rows of stock `lerobot-eval --eval.batch_size=1`."""
+    return stock(dataset, policy, tmp_path_factory.mktemp("stock"))
+
+
+def stock(dataset, policy, out, *extra):
     from lerobot.scripts import lerobot_eval as script
 
     import lerobot_roborecover.plugin as plugin
 
-    out = tmp_path_factory.mktemp("stock")
     argv = [
         "lerobot-eval", "--env", "roborecover_fake", f"--env.scenarios={dataset}", f"--policy.path={policy}",
         "--policy.device=cpu", f"--eval.n_episodes={TRIALS}", "--eval.batch_size=1",
-        "--eval.use_async_envs=false", f"--output_dir={out}",
+        "--eval.use_async_envs=false", f"--output_dir={out}", *extra,
     ]  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", plugin.rewrite_env_argument(argv))
@@ -89,6 +92,14 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys):
     by_id = {t["task_id"]: t["metrics"]["successes"] for t in info["per_task"]}
     assert all(by_id[r.scenario_id][r.trial] == r.success for r in rows)
     assert "Recovery success (RSR)" in capsys.readouterr().out
+
+
+def test_real_time_is_the_same_under_lerobot_eval(run, whole, dataset, policy, tmp_path):
+    """A policy that is asked step by step, four actions an inference."""
+    slow = ("--env.realtime=true", "--env.latency_s=0.1")
+    rows = rows_of(run(*slow))
+    assert outcomes(rows) == stock(dataset, policy, tmp_path / "stock", *slow) != whole
+    assert {(r.options["realtime"], r.options["latency_s"]) for r in rows} == {("hold", 0.1)}
 
 
 def test_a_rerun_repeats_nothing(run, whole):
