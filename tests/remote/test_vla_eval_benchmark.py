@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import anyio
 import numpy as np
 import pytest
 import yaml
@@ -57,6 +56,7 @@ def pusher(obs):
 
 def run(url, tmp_path, dataset, name="out", server=None, **params):
     """The harness, as `vla-eval run` starts it; its result."""
+    import anyio
     from vla_eval.orchestrator import Orchestrator
 
     config = yaml.safe_load((EXAMPLE / "libero.yaml").read_text())
