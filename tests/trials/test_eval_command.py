@@ -235,6 +235,8 @@ def test_without_videos_nothing_is_rendered(run, monkeypatch, tmp_path):
         (["--videos=1", "--runner.render_device=99"], "render_device=99"),
         (["--shard=7/7"], "0 <= k < n"),
         (["--eval.recording=true"], "--videos=N"),
+        (["--env.latency_s=0.1"], "--env.realtime=true only"),
+        (["--env.realtime=true", "--env.meanwhile=chunk"], "4 actions of an inference one by one"),
     ],
 )
 def test_refusals_are_one_line_and_run_nothing(run, capsys, extra, words):
