@@ -307,7 +307,7 @@ def test_strange_frames_are_answered_in_words(act):  # noqa: F811
 
 @pytest.mark.nightly
 def test_strange_frames_for_minutes(act):  # noqa: F811
-    """`ROBORECOVER_FUZZ` frames, 10,000 by default: some ten minutes."""
+    """`ROBORECOVER_FUZZ` frames, 10,000 by default: some four minutes of a core; 30,000 take ten."""
     fuzz(act[0], examples=int(os.environ.get("ROBORECOVER_FUZZ", "10000")))
 
 
