@@ -89,6 +89,8 @@ class Platform:
     """Largest |value| of an action that the simulator does not cut; infinite for joint targets."""
     action_names: ClassVar[Mapping[int, tuple[str, ...]]] = {}
     """By action width: what each value is, for people; names that end with `gripper` command grippers."""
+    gripper_commands: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+    """Values of a gripper's command that open and close it."""
     axis_angle: ClassVar[Mapping[int, tuple[int, ...]]] = {}
     """By width of a policy's state: which values are an axis-angle of robosuite's quaternion."""
     records_control_mode: ClassVar[str | None] = None

@@ -25,6 +25,7 @@ from lerobot_roborecover.curation.annotation.shown import Shown, shown, take_vot
 from lerobot_roborecover.curation.annotation.votes import VoteBook, VoteError, votes_folder
 from lerobot_roborecover.curation.candidates import CandidateSet, read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 
 NUMBER_DIGITS, TIME_DIGITS = 3, 2
@@ -72,13 +73,15 @@ def annotate(
 def _vote_on_all(book: VoteBook, candidates: CandidateSet, wanted: set[str], fps: float, say: Say) -> None:
     """One annotator, in the order of the dataset."""
     name, done = book.annotator, book.ballot().votes
+    commands = platform_named(candidates.platform).gripper_commands
     left = [c.id for c in candidates.candidates if c.id in wanted and c.id not in done]
     began = time.monotonic()
     outcomes: Counter[str] = Counter()
     for number, candidate in enumerate(left, 1):
         since = time.monotonic()
         episode = shown(candidates, candidates.by_id[candidate], fps)
-        verdict = verdict_on(sheet_of(candidate, episode, fps), partial(reading, episode), EYES[name])
+        sheet = sheet_of(candidate, episode, fps, commands)
+        verdict = verdict_on(sheet, partial(reading, episode), EYES[name])
         vote = _entered(verdict, episode.first_step)
         seconds = round(time.monotonic() - since)
         try:
@@ -112,18 +115,21 @@ def verdict_on(sheet: Sheet, read: Callable[[int], Reading], eye: Eye) -> Verdic
     return judge(look, eye)
 
 
-def sheet_of(candidate: str, episode: Shown, fps: float) -> Sheet:
+def sheet_of(
+    candidate: str, episode: Shown, fps: float, gripper_commands: tuple[float, float] = (-1.0, 1.0)
+) -> Sheet:
     """An episode as a whole. Its rate is that of the times which the page prints.
 
     Args:
         candidate: id.
         episode: what is shown of it.
         fps: frames a second, as recorded.
+        gripper_commands: values that open and close a gripper (`Platform`).
     """
     last = episode.steps - 1
     seconds = as_printed(last / fps, TIME_DIGITS)
     rate = last / seconds if seconds else 1.0
-    return Sheet(candidate, episode.instruction, last, rate, episode.solved, episode.human)
+    return Sheet(candidate, episode.instruction, last, rate, episode.solved, episode.human, gripper_commands)
 
 
 def reading(episode: Shown, frame: int) -> Reading:

@@ -38,6 +38,8 @@ class Sheet:
     """At the last frame."""
     human: bool
     """A person caused the deviation and corrected it."""
+    gripper_commands: tuple[float, float] = (-1.0, 1.0)
+    """Values of a gripper's command that open and close it."""
 
 
 type Reading = Mapping[str, Mapping[str, float]]
@@ -77,4 +79,5 @@ class Look:
         commands = [self.values(HAND, name) for name in names]
         if not commands:
             return np.ones(len(self.readings), dtype=bool)
-        return np.any([c > 0 for c in commands if c is not None], axis=0)
+        opened, shut = self.sheet.gripper_commands
+        return np.any([abs(c - shut) < abs(c - opened) for c in commands if c is not None], axis=0)
