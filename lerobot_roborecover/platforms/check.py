@@ -193,8 +193,11 @@ def _state(simulator: Simulator, task: Task, trace: Trace) -> Check:
         wrong.append("the task's predicate holds in its first state")
     if len(set(trace.hashes)) < len(trace.hashes) // 2:
         wrong.append("state_sha256() hardly changes: it must cover the complete state")
-    if not simulator.observation_space.contains(simulator.observe()):
-        wrong.append("observe() is not in observation_space: keys, shapes, dtypes or bounds differ")
+    try:
+        if not simulator.observation_space.contains(simulator.observe()):
+            wrong.append("observe() is not in observation_space: keys, shapes, dtypes or bounds differ")
+    except Exception as err:  # a simulator may raise whatever it likes
+        wrong.append(f"observe() fails: {type(err).__name__}: {err}"[:500])
     return _verdict(f"{task.name}: state", wrong, f"{len(trace.bodies)} bodies")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from lerobot_roborecover.curation.annotation import automatic
 from lerobot_roborecover.curation.annotation.annotators import EYES, label_kind
 from lerobot_roborecover.curation.annotation.automatic import annotate, as_printed, reading, sheet_of
 from lerobot_roborecover.curation.annotation.discussion import Discussion
+from lerobot_roborecover.curation.annotation.frames import Videos
 from lerobot_roborecover.curation.annotation.looking import LOOK_S, Look, Sheet, frames_to_look_at
 from lerobot_roborecover.curation.annotation.rules import Verdict, judge
 from lerobot_roborecover.curation.annotation.shown import shown
@@ -19,6 +21,7 @@ from lerobot_roborecover.curation.annotation.votes import VoteBook, ballot, read
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.pipeline.work import Work
 from lerobot_roborecover.curation.resolution import ResolutionConfig, decisions_of, resolve, scenarios_of
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
 from tests.support.candidate_files import FPS as RECORDED_FPS
 from tests.support.candidate_files import STEPS, candidate_dataset, rollout
@@ -236,6 +239,31 @@ def test_three_programs_vote_on_recorded_steps(tmp_path, capsys):
     scenarios = scenarios_of(candidates, found, ResolutionConfig())
     assert scenarios
     assert {s.provenance["annotation"]["kind"] for s in scenarios} == {"automatic"}
+
+
+def test_a_platform_says_which_command_closes_its_grippers(tmp_path, monkeypatch):
+    look = seen("auto-1", closed=np.full(LAST + 1, -1.0), cup={"reach": ramp((0, 0.3))})
+    assert not look.closed().any()
+    look.sheet = replace(look.sheet, gripper_commands=(1.0, -1.0))
+    assert look.closed().all()
+    sheets = []
+    monkeypatch.setattr(type(platform_named("fake")), "gripper_commands", (0.0, 0.7))
+    monkeypatch.setattr(
+        automatic, "verdict_on", lambda sheet, *_: sheets.append(sheet) or Verdict(discard="temporary")
+    )
+    annotate(candidate_dataset(tmp_path / "rollouts", 1), print)
+    assert [sheet.gripper_commands for sheet in sheets] == [(0.0, 0.7)] * len(EYES)
+
+
+def test_programs_need_no_video(tmp_path):
+    root = candidate_dataset(tmp_path / "rollouts", 2)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"] = {k: f for k, f in info["features"].items() if f["dtype"] != "video"}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ScenarioError, match="has no video; annotators need something to look at"):
+        Videos(root)
+    annotate(root, print)
+    assert all(len(ballot(r, 1).votes) == 2 for r in read_votes(votes_folder(root, None)).values())
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path, monkeypatch, capsys):

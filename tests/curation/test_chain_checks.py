@@ -92,6 +92,15 @@ def test_what_is_found_before_anything_runs(problems, monkeypatch, key, value, w
 
 
 @pytest.mark.lerobot
+def test_programs_annotate_without_frames(problems):
+    problems.good["annotate"] = {**problems.good.get("annotate", {}), "automatic": True}
+    parts = problems.good["collect"].items()
+    problems.good["collect"] = {name: {**part, "frames": "none"} for name, part in parts}
+    assert not [p for p in problems() if "frame" in p]
+    assert any("frame sizes differ" in p for p in problems("collect.biased.frames", 32))
+
+
+@pytest.mark.lerobot
 def test_a_build_that_can_run_has_no_problems_and_all_are_told_at_once(problems, policy):
     assert problems() == []
     votes = problems.root / "votes"

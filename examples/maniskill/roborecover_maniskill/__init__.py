@@ -42,6 +42,7 @@ PANDA_TASKS = {
     "RollBall-v1": Row("roll the ball onto the target", 80, "ball", "goal_region", 0.035),
     "PullCubeTool-v1": Row("pull the cube close with the L-shaped tool", 100),
     "PegInsertionSide-v1": Row("insert the orange end of the peg into the box", 100),
+    "PlugCharger-v1": Row("plug the charger into the receptacle", 200),
     "StackPyramid-v1": Row("put the red cube next to the green one, and the blue cube on both", 250),
 }
 SO100_TASKS = {

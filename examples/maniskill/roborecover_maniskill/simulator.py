@@ -97,7 +97,13 @@ class ManiSkillSimulator:
         joints = env.agent.robot.get_qpos()[0].double().numpy()
         seen: Observation = {"agent_pos": joints, "environment_state": scene.ravel()}
         if self._pictures:
-            seen["pixels"] = env.get_sensor_images()["base_camera"]["rgb"][0].cpu().numpy()
+            for goal in env._hidden_objects:
+                goal.hide_visual()
+            env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+            camera = env.scene.sensors["base_camera"]
+            camera.capture()
+            found = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+            seen["pixels"] = found["rgb"][0].cpu().numpy()
         return seen
 
     def render(self) -> np.ndarray:

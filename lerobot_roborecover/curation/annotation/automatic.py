@@ -62,7 +62,7 @@ def annotate(
             f"there is no automatic annotator {unknown[0]!r:.80}; there are {', '.join(EYES)}"
         )
     candidates = read_candidates(dataset)
-    fps = Videos(dataset).fps
+    fps = Videos(dataset, needed=False).fps
     wanted, discussion = to_vote_on(candidates, only)
     folder, number = votes_folder(dataset, votes), discussion.round if discussion else 1
     for name in annotators:

@@ -48,12 +48,13 @@ class Videos:
 
     Args:
         root: the dataset's folder.
+        needed: refuse a dataset without any; programs that read numbers need none.
 
     Raises:
-        ScenarioError: it is not such a dataset, or has no video.
+        ScenarioError: it is not such a dataset, or has no video and needs one.
     """
 
-    def __init__(self, root: Path):
+    def __init__(self, root: Path, needed: bool = True):
         self.root = root
         path = root / "meta" / "info.json"
         try:
@@ -66,7 +67,7 @@ class Videos:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
             raise ScenarioError(f"{path} is not LeRobot's ({err!r:.200}); fetch the dataset again") from None
-        if not self.cameras:
+        if not self.cameras and needed:
             raise ScenarioError(f"{root} has no video; annotators need something to look at. Record one")
         for camera in self.cameras:
             if "/" in camera or ".." in camera:

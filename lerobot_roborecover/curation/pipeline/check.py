@@ -152,7 +152,9 @@ def _check_sizes(config: ChainConfig) -> None:
         if part.dataset:
             sizes[name] = _filmed(Path(part.dataset))
         elif str(part.frames or _SIZE) == "none":
-            raise OptionError(f"collect.{name}.frames: none; annotators need something to look at")
+            if not config.annotate.automatic:  # programs read numbers
+                raise OptionError(f"collect.{name}.frames: none; annotators need something to look at")
+            sizes[name] = {(0, 0)}
         elif platform_named(config.platform).sizes_pictures and str(part.frames or _SIZE).isdigit():
             side = int(part.frames or _SIZE)
             if side % 2:
