@@ -26,6 +26,7 @@ HANDOFF_TOLERANCE_M = 0.002
 
 MAX_PREFIX_STEPS = 20_000
 MAX_ACTION_MAGNITUDE = 1e3
+MAX_OPTIONS_CHARS = 10_000
 MAX_ID_CHARS = 200
 """Of an id. File systems bear names of 255 bytes, and an id becomes a part of some: the longest are films,
 `<id>_trial<number>_solved_by_prefix.mp4`, with 37 bytes beside the id at ten digits, and LeRobot's own folder
@@ -200,6 +201,8 @@ class Reset:
     """Poses of fixtures that the simulator would otherwise draw at random at each reset (LIBERO), by body
     name.
     Empty: the reset of a fresh environment after `seed`."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """What the environment's own reset takes beside the seed; JSON (`gymnasium.Env.reset`)."""
 
     def __post_init__(self):
         for label in ("seed", "init_state_index"):
@@ -209,6 +212,35 @@ class Reset:
         if not isinstance(self.settle_steps, int) or not 0 <= self.settle_steps <= 1000:
             raise ScenarioError(f"reset settle_steps {self.settle_steps!r} is not a count from 0 to 1000")
         object.__setattr__(self, "fixtures", dict(self.fixtures))
+        try:
+            text = json.dumps(dict(self.options), sort_keys=True, allow_nan=False)
+        except (TypeError, ValueError) as err:
+            raise ScenarioError(f"reset options {self.options!r:.200} are not JSON: {err}") from None
+        if len(text) > MAX_OPTIONS_CHARS:
+            raise ScenarioError(f"reset options are {len(text)} characters; the limit is {MAX_OPTIONS_CHARS}")
+        object.__setattr__(self, "options", json.loads(text))
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; options alone are left out where there are none, as before there were any."""
+        fixtures = {name: [*pose.position_m, *pose.quat_xyzw] for name, pose in self.fixtures.items()}
+        found = {
+            "seed": self.seed,
+            "init_state_index": self.init_state_index,
+            "settle_steps": self.settle_steps,
+            "fixtures": fixtures,
+        }
+        return found | ({"options": dict(self.options)} if self.options else {})
+
+    @classmethod
+    def of_json(cls, values: Mapping[str, Any]) -> Reset:
+        """From `as_json`'s.
+
+        Raises:
+            ScenarioError: a value is not usable.
+            TypeError: a name is none of them.
+        """
+        fixtures = {n: Pose.of(v) for n, v in (values.get("fixtures") or {}).items()}
+        return cls(**{**values, "fixtures": fixtures})
 
 
 @dataclass(frozen=True)
@@ -302,7 +334,8 @@ class Rollout:
             r.settle_steps,
         ]
         fixtures = [[n, *p.position_m, *p.quat_xyzw] for n, p in sorted(r.fixtures.items())]
-        digest = hashlib.sha256(json.dumps([head, fixtures, list(self.actions.shape)]).encode())
+        about = [head, fixtures, list(self.actions.shape), *([r.options] if r.options else [])]
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
         digest.update(self.actions.astype("<f8").tobytes())
         return digest.hexdigest()
 

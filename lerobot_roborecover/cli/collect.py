@@ -128,7 +128,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
     from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
     from lerobot_roborecover.curation.collect.starts import parse_numbers
     from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.platforms import platform_names
+    from lerobot_roborecover.platforms import platform_named, platform_names
     from lerobot_roborecover.platforms.base import ENV_PREFIX
     from lerobot_roborecover.platforms.starts import Starts
 
@@ -154,7 +154,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
     seeds = parse_numbers(args.seeds, "--seeds") if args.seeds else ()
     states = parse_numbers(args.init_states, "--init-states") if args.init_states else ()
     return CollectOptions(
-        platform=kind,
+        platform=platform_named(kind).member_of(env).name,
         out=args.out,
         starts=Starts(seeds, states, args.draw, args.seed, args.trials, args.reset_seed),
         tasks=tuple(args.task),

@@ -18,6 +18,7 @@ import numpy as np
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial_log import Finished, RowLog, TrialRow, read_trial_log, trial_key
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
@@ -207,7 +208,24 @@ def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> Re
 
     from lerobot_roborecover.env.configs import env_type
 
-    return draccus.parse(env_type(platform), args=[f"--scenarios={scenarios}", *options])
+    which = [f"--{name}={value}" for name, value in flat_options(platform_named(platform).env_defaults)]
+    return draccus.parse(env_type(platform), args=[*which, f"--scenarios={scenarios}", *options])
+
+
+def flat_options(nested: Mapping[str, Any], head: str = "") -> list[tuple[str, Any]]:
+    """Options of a configuration file as those of a command line, `a.b` for `b` within `a`.
+
+    Args:
+        nested: mappings of mappings.
+        head: of their names.
+    """
+    found = []
+    for name, value in nested.items():
+        if isinstance(value, Mapping):
+            found += flat_options(value, f"{head}{name}.")
+        else:
+            found.append((f"{head}{name}", value))
+    return found
 
 
 def actions_digest(actions: np.ndarray) -> str:

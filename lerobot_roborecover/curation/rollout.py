@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,13 +14,21 @@ PERTURBED_STEPS = 150
 """Interaction steps in which actions are perturbed (paper, "Action-Perturbed Scenarios")."""
 
 
-def perturb_translations(action: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds independent Uniform(-1, 1) to the three translations, in normalised action space (paper, eq.
-    1)."""
+def perturb_translations(
+    action: np.ndarray, rng: np.random.Generator, reach: Sequence[float] = (1.0, 1.0, 1.0)
+) -> np.ndarray:
+    """Adds independent Uniform(-1, 1) to the three translations, in normalised action space (paper, eq. 1).
+
+    Args:
+        action: (A,).
+        rng: draws.
+        reach: half-widths by leading value, where a platform's actions are no normalised translations
+            (`Platform.perturbation`).
+    """
     action = np.array(action, dtype=np.float64)
-    noise = rng.uniform(-1.0, 1.0, 3)
-    translations = min(len(action), 3)  # two in a plane
-    action[:translations] += noise[:translations]
+    noise = rng.uniform(-1.0, 1.0, len(reach)) * reach
+    disturbed = min(len(action), len(reach))  # two in a plane
+    action[:disturbed] += noise[:disturbed]
     return action
 
 

@@ -31,6 +31,7 @@ from lerobot_roborecover.datasets.schema import (
     MAX_MANIFEST_BYTES,
     MAX_PARQUET_BYTES,
     SCENARIOS_FILE,
+    RESET_OPTIONS,
     SCHEMA,
     SCHEMA_VERSION,
     check_limits,
@@ -110,9 +111,12 @@ def _refuse_constant(name: str) -> None:
 
 def _parse(path: Path, data: bytes) -> list[Scenario]:
     try:
-        check_bounds(path, data)
         with pq.ParquetFile(pa.BufferReader(data)) as file:
-            table = file.read(columns=SCHEMA.names, use_threads=False)
+            optional = [RESET_OPTIONS] if RESET_OPTIONS.name in file.schema_arrow.names else []
+        schema = pa.schema([*SCHEMA, *optional])
+        check_bounds(path, data, schema)
+        with pq.ParquetFile(pa.BufferReader(data)) as file:
+            table = file.read(columns=schema.names, use_threads=False)
         table.validate(full=True)
     except ScenarioError:
         raise
@@ -147,13 +151,10 @@ def _to_scenario(record: Mapping[str, Any], prefix: np.ndarray) -> Scenario:
         )
     platform_named(record["platform"]).check_width(width, f"scenario {record['id']!s:.140}")
     with _at("field provenance"):
-        try:
-            provenance = json.loads(record["provenance"], parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as err:
-            raise ScenarioError(f"not JSON: {err}") from None
-        if not isinstance(provenance, dict):
-            raise ScenarioError(f"a JSON {type(provenance).__name__}, not an object")
+        provenance = _object(record["provenance"])
     mark = record["fingerprint"]
+    with _at(f"field {RESET_OPTIONS.name}"):
+        options = _object(record.get(RESET_OPTIONS.name) or "{}")
     with _at("field fixtures"):
         fixtures = _poses(record["fixtures"])
     with _at("field fingerprint"):
@@ -172,6 +173,7 @@ def _to_scenario(record: Mapping[str, Any], prefix: np.ndarray) -> Scenario:
             init_state_index=record["init_state_index"],
             settle_steps=record["settle_steps"],
             fixtures=fixtures,
+            options=options,
         ),
         prefix=prefix.reshape(steps, width),
         stage=record["stage"],
@@ -190,6 +192,16 @@ def _to_scenario(record: Mapping[str, Any], prefix: np.ndarray) -> Scenario:
             f"{_FETCH_AGAIN}"
         )
     return scenario
+
+
+def _object(text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as err:
+        raise ScenarioError(f"not JSON: {err}") from None
+    if not isinstance(found, dict):
+        raise ScenarioError(f"a JSON {type(found).__name__}, not an object")
+    return found
 
 
 def _poses(rows: list[Mapping[str, Any]]) -> dict[str, Pose]:

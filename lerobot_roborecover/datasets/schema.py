@@ -99,6 +99,8 @@ SCHEMA = pa.schema(
     ]
 )
 """One row a scenario. `prefix` is (prefix_steps, action_dim) in row-major order, float64."""
+RESET_OPTIONS = pa.field("reset_options", pa.string())
+"""A further column, JSON, of sets in which a reset has options (`Reset.options`)."""
 
 
 def to_row(scenario: Scenario) -> dict[str, Any]:
@@ -120,6 +122,7 @@ def to_row(scenario: Scenario) -> dict[str, Any]:
         "init_state_index": reset.init_state_index,
         "settle_steps": reset.settle_steps,
         "fixtures": _pose_rows(reset.fixtures),
+        RESET_OPTIONS.name: json.dumps(reset.options, sort_keys=True) if reset.options else None,
         "action_dim": scenario.prefix.shape[1],
         "prefix_steps": scenario.prefix.shape[0],
         "prefix": scenario.prefix.ravel(),

@@ -20,7 +20,7 @@ import numpy as np
 from lerobot_roborecover.datasets.files import read_bytes, what_it_is
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.video_frames import check_frames
-from lerobot_roborecover.scenario import Pose, Reset, ScenarioError, Task
+from lerobot_roborecover.scenario import Reset, ScenarioError, Task
 
 TRAJECTORIES_FILE = "trajectories.json"
 SCHEMA_VERSION = 1
@@ -75,8 +75,7 @@ class TrajectoryRow:
         """The reset, where it is known."""
         if self.reset is None:
             return None
-        fixtures = {n: Pose.of(p) for n, p in self.reset["fixtures"].items()}
-        return Reset(fixtures=fixtures, **{k: v for k, v in self.reset.items() if k != "fixtures"})
+        return Reset.of_json(self.reset)
 
 
 @dataclass(frozen=True)

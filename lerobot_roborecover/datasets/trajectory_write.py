@@ -171,20 +171,10 @@ def _row(trajectory: Trajectory, index: int) -> TrajectoryRow:
         scenario_index=index,
         first_step=trajectory.first_step,
         trial=trajectory.trial,
-        reset=None if trajectory.reset is None else _reset_dict(trajectory.reset),
+        reset=None if trajectory.reset is None else trajectory.reset.as_json(),
         not_replayable=trajectory.not_replayable,
         provenance=dict(trajectory.provenance),
     )
-
-
-def _reset_dict(reset: Reset) -> dict[str, Any]:
-    fixtures = {name: [*pose.position_m, *pose.quat_xyzw] for name, pose in reset.fixtures.items()}
-    return {
-        "seed": reset.seed,
-        "init_state_index": reset.init_state_index,
-        "settle_steps": reset.settle_steps,
-        "fixtures": fixtures,
-    }
 
 
 def _check(kind: str, number: int, trajectory: Trajectory, platform: str) -> None:

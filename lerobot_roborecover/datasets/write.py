@@ -23,6 +23,7 @@ from lerobot_roborecover.datasets.schema import (
     MAX_PARQUET_BYTES,
     MAX_SCENARIOS,
     SCENARIOS_FILE,
+    RESET_OPTIONS,
     SCHEMA,
     SCHEMA_VERSION,
     counts,
@@ -172,16 +173,17 @@ def _write_parquet(file: IO[bytes], scenarios: Sequence[Scenario]) -> None:
     # No dictionaries: with plain values the sizes in a file's metadata bound what reading it takes, and the
     # reader insists on that. zstd compresses repeats as well.
     options = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
-    with pq.ParquetWriter(file, SCHEMA, **options) as writer:
+    schema = pa.schema([*SCHEMA, RESET_OPTIONS]) if any(s.reset.options for s in scenarios) else SCHEMA
+    with pq.ParquetWriter(file, schema, **options) as writer:
         for begin in range(0, len(scenarios), _ROWS_PER_GROUP):
             rows = [to_row(s) for s in scenarios[begin : begin + _ROWS_PER_GROUP]]
             try:
-                columns = [pa.array([row[f.name] for row in rows], f.type) for f in SCHEMA]
+                columns = [pa.array([row[f.name] for row in rows], f.type) for f in schema]
             except UnicodeEncodeError as err:
                 raise ScenarioError(
                     f"rows {begin} to {begin + len(rows) - 1}: text is not valid Unicode: {err}"
                 ) from None
-            writer.write_table(pa.Table.from_arrays(columns, schema=SCHEMA))
+            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
     if file.tell() > MAX_PARQUET_BYTES:
         raise ScenarioError(
             f"{SCENARIOS_FILE} would have {file.tell()} bytes; the limit is {MAX_PARQUET_BYTES}. "

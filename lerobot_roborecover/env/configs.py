@@ -70,7 +70,7 @@ class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
             )
         setup = self.simulator_setup()
         slot = SlotConfig(
-            self.platform_name,
+            setup.platform or self.platform_name,
             dict(setup.options),
             approximate_snapshots=setup.approximate_snapshots,
             control_mode=setup.control_mode,
@@ -99,6 +99,8 @@ def _env_type(platform: Platform) -> type[RecoveryEnvConfig]:
 def _register_all() -> tuple[dict[str, type[RecoveryEnvConfig]], dict[str, str]]:
     found, unusable = {}, {}
     for platform in all_platforms():
+        if platform.env_name:
+            continue  # another's env type serves it
         try:
             found[platform.name] = _env_type(platform)
         except Exception as err:  # somebody else's platform must not take LeRobot's programs down
@@ -119,7 +121,10 @@ def env_type(platform: str) -> type[RecoveryEnvConfig]:
         ScenarioError: there is no such platform.
     """
     if platform not in ENV_TYPES:
-        name = platform_named(platform).name
+        found = platform_named(platform)
+        name = found.env_name or found.name
+        if name in ENV_TYPES:
+            return ENV_TYPES[name]
         raise OptionError(
             f"--env.type={ENV_PREFIX}{name}: the platform's env config is not usable: "
             f"{_UNUSABLE.get(name, 'it was registered after the plugin was imported')}"

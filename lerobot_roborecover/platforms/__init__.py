@@ -17,7 +17,9 @@ from lerobot_roborecover.scenario import ScenarioError
 
 ENTRY_POINTS = "roborecover.platforms"
 """Entry-point group: `name = "module:PLATFORM"`, an instance of `Platform`, or the class."""
-BUILT_IN = ("libero", "metaworld", "robotwin", "fake")
+BUILT_IN = ("libero", "metaworld", "robotwin", "fake", "lerobot")
+_FAMILY = "lerobot_"
+"""Of names of the one family: `lerobot_<env type>`."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,8 +43,10 @@ def platform_named(name: str) -> Platform:
 
 
 def platform_names() -> tuple[str, ...]:
-    """All names: ours first, then those of other distributions."""
-    return (*BUILT_IN, *(name for name in _registered() if name not in BUILT_IN))
+    """All names: ours first, the known env types of LeRobot's, then those of other distributions."""
+    from lerobot_roborecover.platforms import lerobot
+
+    return (*BUILT_IN, *lerobot.PLATFORM.members(), *_registered())
 
 
 def all_platforms() -> tuple[Platform, ...]:
@@ -83,6 +87,10 @@ def _registered() -> dict[str, EntryPoint]:
 def _load(name: str) -> Platform | None:
     if name in BUILT_IN:
         return importlib.import_module(f"lerobot_roborecover.platforms.{name}").PLATFORM
+    if name.startswith(_FAMILY) and name not in _registered():
+        from lerobot_roborecover.platforms.lerobot import member
+
+        return member(name)
     entry = _registered().get(name)
     if entry is None:
         return None

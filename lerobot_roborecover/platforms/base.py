@@ -61,6 +61,8 @@ class SimulatorSetup:
     """How actions after the handoff are read, for simulators that have more than one way."""
     approximate_snapshots: bool = False
     """Use snapshots also where what follows them drifts from a replay."""
+    platform: str = ""
+    """Which one, where the env type serves several."""
 
 
 class FilmedEnvConfig:
@@ -120,6 +122,25 @@ class Platform:
     perturbable: ClassVar[bool] = True
     """Actions begin with normalised translations that `collect --perturb` can disturb."""
     why_not_perturbable: ClassVar[str] = ""
+    perturbation: ClassVar[tuple[float, ...]] = (1.0, 1.0, 1.0)
+    """Half-widths of the disturbance of an action's leading values, in their own units: the paper's, of
+    normalised translations."""
+    env_name: ClassVar[str] = ""
+    """The env type is `roborecover_<env_name>`, where that is not the platform's name: one that serves several
+    platforms."""
+    env_defaults: ClassVar[Mapping[str, Any]] = {}
+    """Options of that env type that name this platform, nested as in a configuration file."""
+
+    def member_of(self, options: Sequence[str]) -> Platform:
+        """The platform that options of the env type choose, where it serves several.
+
+        Args:
+            options: `name=value`, as after `--env.`.
+
+        Raises:
+            ScenarioError: they name none.
+        """
+        return self
 
     def grippers(self, width: int) -> tuple[int, ...]:
         """Which values of an action command grippers.

@@ -59,6 +59,8 @@ class Trace:
     """T + 1 answers of the task's predicate."""
     bodies: Mapping[str, Pose]
     """At the end."""
+    parts: tuple[Mapping[str, str], ...] = ()
+    """T + 1 hashes by part of the state, of simulators that tell (`state_parts`)."""
 
     def difference(self, other: Trace) -> str:
         """Where another run leaves this one, and by how much at its end; empty where it does not."""
@@ -70,8 +72,12 @@ class Trace:
         if step is None:
             return "the same states, but another answer of the success predicate"
         away = [1e3 * p.distance_m(other.bodies[n]) for n, p in self.bodies.items() if n in other.bodies]
+        which = ""
+        if step is not None and self.parts and other.parts:
+            one, two = self.parts[step], other.parts[step]
+            which = f" in {', '.join(n for n in one if one[n] != two.get(n))}"
         return (
-            f"states differ from step {step} of {len(self.hashes) - 1} on; at the end bodies are up to "
+            f"states differ{which} from step {step} of {len(self.hashes) - 1} on; at the end bodies are up to "
             f"{max(away, default=0.0):.4g} mm away"
         )
 
@@ -107,6 +113,9 @@ def check_platform(request: CheckRequest) -> Iterator[Check]:
 def actions_for(platform: Platform, simulator: Simulator, request: CheckRequest) -> np.ndarray:
     """(T, A) float64 random actions."""
     rng = np.random.default_rng(request.seed)
+    own = getattr(simulator, "random_actions", None)  # of one that knows its own space
+    if own is not None:
+        return own(rng, request.steps)
     return platform.random_actions(rng, request.steps, simulator.action_dim)
 
 
@@ -120,14 +129,17 @@ def run(simulator: Simulator, task: Task, reset: Reset, actions: np.ndarray, *, 
         actions: (T, A) float64.
         look: observe and render after every step.
     """
-    hashes, success = [], []
+    hashes, success, parts = [], [], []
+    tell = getattr(simulator, "state_parts", None)
     for step in walk(simulator, Rollout(task, reset, actions)):
         hashes.append(simulator.state_sha256())
+        if tell is not None:
+            parts.append(tell())
         success.append(simulator.succeeded())
         if look and step < len(actions):
             simulator.observe()
             simulator.render()
-    return Trace(tuple(hashes), tuple(success), simulator.bodies())
+    return Trace(tuple(hashes), tuple(success), simulator.bodies(), tuple(parts))
 
 
 def _declarations(platform: Platform, simulator: Simulator) -> Iterator[Check]:

@@ -22,6 +22,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.env.configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.env.facts import facts_of
@@ -173,7 +174,7 @@ def _env_config(env: Mapping[str, Any] | RecoveryEnvConfig | None, platform: str
     if env is not None and not isinstance(env, Mapping):
         return copy(env)
     try:
-        return draccus.decode(env_type(platform), dict(env or {}))
+        return draccus.decode(env_type(platform), {**platform_named(platform).env_defaults, **(env or {})})
     except (draccus.utils.DraccusException, ValueError, TypeError) as err:
         raise OptionError(f"env={dict(env or {})}: {' '.join(str(err).split())}") from None
 

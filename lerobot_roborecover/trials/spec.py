@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.base import ENV_PREFIX
 from lerobot_roborecover.whole import write_whole
 
@@ -40,8 +41,9 @@ class RunSpec:
 
     def config(self) -> dict[str, Any]:
         """The configuration, in LeRobot's words; plain values only."""
+        own = platform_named(self.platform)
         found = {
-            "env": {"type": f"{ENV_PREFIX}{self.platform}", **self.env},
+            "env": {"type": f"{ENV_PREFIX}{own.env_name or own.name}", **own.env_defaults, **self.env},
             "policy": dict(self.policy),
             "eval": {"n_episodes": self.trials},
             "seed": self.seed,

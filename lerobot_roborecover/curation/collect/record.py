@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ import numpy as np
 
 from lerobot_roborecover.curation.collect.starts import Planned
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS, perturb_translations
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.limits import Workspace, limits_of
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.starts import stream
 from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
-from lerobot_roborecover.scenario import Pose, Reset, ScenarioError
+from lerobot_roborecover.scenario import Reset, ScenarioError
 from lerobot_roborecover.whole import new_file
 
 
@@ -68,11 +69,10 @@ def record_path(folder: str | os.PathLike[str], rollout_id: str) -> Path:
 
 def write_record(path: Path, record: Record) -> None:
     """Writes a record, on disk when this returns."""
-    fixtures = {name: [*p.position_m, *p.quat_xyzw] for name, p in record.reset.fixtures.items()}
     about = {
         "schema": 1,
         "bodies": list(record.steps.bodies),
-        "reset": {**asdict(replace(record.reset, fixtures={})), "fixtures": fixtures},
+        "reset": record.reset.as_json(),
         "workspace": None if record.workspace is None else asdict(record.workspace),
     }
     with new_file(path) as temporary, open(temporary, "wb") as file:
@@ -97,11 +97,9 @@ def read_record(path: Path) -> Record:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         about = json.loads(str(arrays["about"]))
-        reset = dict(about["reset"])
-        reset["fixtures"] = {n: Pose(tuple(v[:3]), tuple(v[3:])) for n, v in reset["fixtures"].items()}
         place = about["workspace"]
         return Record(
-            Reset(**reset),
+            Reset.of_json(about["reset"]),
             arrays["actions"],
             Steps(
                 dict(zip(about["bodies"], arrays["poses"], strict=True)),
@@ -151,6 +149,7 @@ class RecordingSimulator:
         assert self._plan is not None, "reset without a plan"
         self._recorder.reset(task, reset)
         self._noise = None
+        self._reach = platform_named(task.platform).perturbation
         if self._plan.disturbed:
             self._noise = stream(self._settings.seed, "perturbation", task, reset, self._plan.trial)
         self._settling, self._last = reset.settle_steps, reset.settle_steps + task.horizon
@@ -173,7 +172,7 @@ class RecordingSimulator:
         if self._noise is None or not 0 <= t < self._settings.perturbed_steps:
             return action, UNPERTURBED
         # Drawn whether or not it is executed: what comes later does not depend on reach.
-        noisy = perturb_translations(action, self._noise)
+        noisy = perturb_translations(action, self._noise, self._reach)
         if self._limits is not None and not self._limits.reachable(noisy):
             return action, UNREACHABLE
         return noisy, PERTURBED

@@ -1,0 +1,109 @@
+"""Env types that are known without importing LeRobot, which takes fifteen seconds: what their own configs and
+packages say of them, and what those leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.platforms.base import Driver, Expert
+from lerobot_roborecover.scenario import Task
+
+
+@dataclass(frozen=True)
+class EnvFacts:
+    """What is known of an env type."""
+
+    package: str
+    """Module whose import registers the Gymnasium ids `<package>/<task>`."""
+    title: str
+    """For people."""
+    tasks: Mapping[str, str]
+    """Instruction by task."""
+    horizon: int
+    """`episode_length` of LeRobot's config, steps."""
+    control_hz: float
+    """`fps` of LeRobot's config."""
+    action_names: tuple[str, ...]
+    """What each value of an action is."""
+    kwargs: Mapping[str, Any]
+    """Of the env where nothing is drawn and nobody asks for pictures."""
+    state_width: int
+    """Values of `agent_pos`."""
+    environment_width: int = 0
+    """Values of `environment_state`; 0 where there is none."""
+    versions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Distributions that decide scores, beside LeRobot."""
+    perturbation: tuple[float, ...] = ()
+    """Half-widths of the disturbance of an action's leading values, in the env's own units."""
+    exact_snapshots: bool = False
+    """A restored snapshot continues bit for bit: the environment's Python keeps nothing beside its physics."""
+    scenarios: str = ""
+    """Shipped set."""
+    experts: Mapping[str, Expert] = field(default_factory=dict)
+
+
+def _pusher(patience: int, hurry: float, about: str) -> Expert:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+        from lerobot_roborecover.platforms.lerobot.pusht import Pusher
+
+        return Pusher(simulator.env.unwrapped, rng, patience=patience, hurry=hurry)
+
+    return Expert(make, about)
+
+
+def _transfer(slip_m: float, about: str) -> Expert:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+        from lerobot_roborecover.platforms.lerobot.aloha import Transfer
+
+        return Transfer(simulator.env.unwrapped, rng, slip_m=slip_m)
+
+    return Expert(make, about)
+
+
+_ARM = ("waist", "shoulder", "elbow", "forearm roll", "wrist angle", "wrist rotate", "gripper")
+
+KNOWN: Mapping[str, EnvFacts] = {
+    "pusht": EnvFacts(
+        package="gym_pusht",
+        title="PushT",
+        tasks={"PushT-v0": "Push the T-shaped block onto the T-shaped target."},
+        horizon=300,
+        control_hz=10.0,
+        action_names=("right", "down"),
+        kwargs={"obs_type": "environment_state_agent_pos", "render_mode": "rgb_array"},
+        state_width=2,
+        environment_width=16,
+        versions={"gym-pusht": ("0.1.8",), "pymunk": ("6.11.1",), "shapely": ("2.2.0",)},
+        perturbation=(80.0, 80.0),
+        scenarios="pusht_starter",
+        experts={
+            "expert": _pusher(0, 1.0, "plans its pushes in a copy of the simulator"),
+            "expert_hurried": _pusher(0, 2.5, "pushes two and a half times as fast as it plans"),
+        },
+    ),
+    "aloha": EnvFacts(
+        package="gym_aloha",
+        title="Aloha",
+        tasks={
+            "AlohaTransferCube-v0": ("Pick up the cube with the right arm and transfer it to the left arm."),
+            "AlohaInsertion-v0": "Insert the peg into the socket.",
+        },
+        horizon=400,
+        control_hz=50.0,
+        action_names=tuple(f"{side} {name}" for side in ("left", "right") for name in _ARM),
+        kwargs={"obs_type": "pixels_agent_pos", "render_mode": "rgb_array"},
+        state_width=14,
+        versions={"gym-aloha": ("0.1.5",), "dm-control": ("1.0.30",), "mujoco": ("3.3.2",)},
+        perturbation=(0.0,) * 7 + (0.15,) * 6,
+        exact_snapshots=True,
+        experts={
+            "expert": _transfer(0.0, "transfers the cube (AlohaTransferCube-v0 alone)"),
+            "expert_biased": _transfer(0.03, "the same, and sees the cube up to 3 cm off"),
+        },
+    ),
+}
+"""By env type."""

@@ -1,0 +1,232 @@
+"""What an env type of LeRobot's is besides its simulator: one family, a member per type."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
+from typing import Any, ClassVar
+
+from lerobot_roborecover.platforms.base import Expert, Platform
+from lerobot_roborecover.platforms.lerobot.known import KNOWN, EnvFacts
+from lerobot_roborecover.platforms.lerobot.source import EnvSource, registered_tasks
+from lerobot_roborecover.platforms.names import nearest
+from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
+from lerobot_roborecover.scenario import ScenarioError, Task
+
+FAMILY_NAME = "lerobot"
+DEFAULT_TYPE = "pusht"
+HUB_TYPE = "hub"
+_WIDEST = 64
+"""Values in a recorded action, at most (the scenario format's limit)."""
+
+
+class LeRobotPlatform(Platform):
+    """One env type, `lerobot_<type>`; tasks have the type as their suite.
+
+    Args:
+        env_type: LeRobot's name.
+    """
+
+    simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
+    extra = "gym"
+    env_name = FAMILY_NAME
+
+    def __init__(self, env_type: str):
+        self.env_type = env_type
+        self.name = member_name(env_type)
+        self.env_defaults = {"base": {"type": env_type}}
+        known = KNOWN.get(env_type)
+        self.title = known.title if known else f"LeRobot's {env_type}"
+        self.action_widths = (len(known.action_names),) if known else tuple(range(1, _WIDEST + 1))
+        self.action_bound = float("inf")
+        self.action_names = {len(known.action_names): known.action_names} if known else {}
+        self.required_versions = {"lerobot": ("0.6.1",), **known.versions} if known else {}
+        self.default_scenarios = known.scenarios if known else ""
+        self.experts: Mapping[str, Expert] = known.experts if known else {}
+        self.perturbation = known.perturbation if known else ()
+        self.perturbable = bool(self.perturbation)
+        self.why_not_perturbable = (
+            f"nobody has said how far an action of env type {env_type} may be disturbed in its own units"
+        )
+
+    @cached_property
+    def facts(self) -> EnvFacts:
+        """Of the type; asks LeRobot's own config where it is not a known one."""
+        return KNOWN.get(self.env_type) or _asked_of_lerobot(self.env_type)
+
+    @property
+    def control_hz(self) -> float:  # ty: ignore[invalid-attribute-override] - of one that LeRobot must be asked
+        """`fps` of LeRobot's config."""
+        return self.facts.control_hz
+
+    def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
+        """Those that the type's package registers, or that its config makes."""
+        source = EnvSource.of((options or {}).get("source") or {})
+        names = dict(self.facts.tasks)
+        if source.hub or source.config:
+            names = {str((options or {}).get("task", "")): str((options or {}).get("instruction", ""))}
+        elif not names:
+            names = dict.fromkeys(registered_tasks(self.facts.package), "")
+        return [self._task(name, said) for name, said in names.items()]
+
+    def _task(self, name: str, instruction: str = "") -> Task:
+        return Task(self.name, self.env_type, name, instruction or name, self.facts.horizon)
+
+    def task(self, name: str, instruction: str = "", suite: str = "") -> Task:
+        """By name, also of a type whose tasks nobody lists."""
+        if self.env_type in KNOWN:
+            return super().task(name, instruction, suite)
+        return self._task(name, instruction)
+
+    def check_task(self, task: Task) -> None:
+        """By suite; of a known type, also by name."""
+        if self.env_type in KNOWN:
+            super().check_task(task)
+        elif task.suite != self.env_type:
+            raise ScenarioError(f"{self.name} has no suite {task.suite!r}; there is {self.env_type}")
+
+    def short_name(self, task: Task) -> str:
+        """With the type."""
+        return f"{self.env_type}.{task.name}"
+
+    def cannot_drive(self, task: Task) -> str:
+        """Aloha's insertion has no script."""
+        return "its driver transfers the cube alone" if task.name == "AlohaInsertion-v0" else ""
+
+    def make_simulator(self, **options: Any) -> Simulator:
+        """See `Platform.make_simulator`; what is not given is the type's own.
+
+        Args:
+            options: `source`, `task` and `control_hz` of `LeRobotSimulator`, as an env config gives them; or
+                `obs_type` and the size of pictures, for a known type.
+        """
+        given = dict(options)
+        given.pop("instruction", None)
+        if "source" not in given:
+            given = {**self._plain_source(given), **{k: v for k, v in given.items() if k in _OWN}}
+        given.setdefault("control_hz", self.facts.control_hz)
+        given.setdefault("exact_snapshots", self.facts.exact_snapshots)
+        return super().make_simulator(env_type=self.env_type, platform=self.name, **given)
+
+    def _plain_source(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        facts = self.facts
+        kwargs = dict(facts.kwargs)
+        if options.get("obs_type", "state") != "state":
+            kwargs["obs_type"] = options["obs_type"]
+        if self.env_type in KNOWN:
+            kwargs |= {k: v for k, v in options.items() if k in _PICTURES}
+        task = next(iter(facts.tasks), "") or next(iter(registered_tasks(facts.package)), "")
+        return {"source": EnvSource(package=facts.package, kwargs=kwargs).as_options(), "task": task}
+
+    def picture_options(self, size: int) -> dict[str, Any]:
+        """Of PushT and Aloha; other types draw as large as they please."""
+        return super().picture_options(size) if size else {"obs_type": "state"}
+
+    def owns_observation(self, observation: Mapping[str, tuple[int, ...]]) -> bool:
+        """By the widths of its states."""
+        known = KNOWN.get(self.env_type)
+        if known is None:
+            return False
+        environment = observation.get("observation.environment_state", (known.environment_width,))
+        same = observation.get("observation.state", ())[-1:] == (known.state_width,)
+        return same and environment[-1:] == (known.environment_width,)
+
+    def env_config(self) -> type:
+        """The family's."""
+        return FAMILY.env_config()
+
+
+_OWN = ("control_hz",)
+_PICTURES = ("observation_height", "observation_width", "visualization_height", "visualization_width")
+
+
+class LeRobotFamily(Platform):
+    """`--env roborecover_lerobot --env.base.type=NAME`: every member under one env type."""
+
+    name: ClassVar[str] = FAMILY_NAME
+    title = "LeRobot's env types"
+    action_widths: ClassVar[tuple[int, ...]] = (2,)
+    control_hz = 10.0
+    extra = "gym"
+    simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
+    default_scenarios = "pusht_starter"
+
+    def member_of(self, options: Sequence[str]) -> Platform:
+        """The platform that `base.type=NAME` names; PushT where nothing does."""
+        chosen = [o.partition("=")[2] for o in options if o.lstrip("-").startswith("base.type=")]
+        return member(member_name(chosen[-1] if chosen else DEFAULT_TYPE))
+
+    def members(self) -> tuple[str, ...]:
+        """Those that are known without LeRobot."""
+        return tuple(member_name(kind) for kind in KNOWN)
+
+    def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
+        """Those of the default member."""
+        return member(member_name(DEFAULT_TYPE)).tasks(options)
+
+    def make_simulator(self, **options: Any) -> Simulator:
+        """Of the default member."""
+        return member(member_name(DEFAULT_TYPE)).make_simulator(**options)
+
+    def env_config(self) -> type:
+        """LeRobot's own config of the base type, inside one of ours."""
+        from lerobot_roborecover.platforms.lerobot.env_config import LeRobotConfig
+
+        return LeRobotConfig
+
+
+FAMILY = LeRobotFamily()
+
+
+def member_name(env_type: str) -> str:
+    """The platform's name of an env type."""
+    plain = re.sub(r"[^a-z0-9_]", "_", env_type.lower())
+    return f"{FAMILY_NAME}_{plain}"[:40]
+
+
+@cache
+def member(name: str) -> LeRobotPlatform:
+    """A member by its platform name.
+
+    Args:
+        name: `lerobot_<type>`.
+
+    Raises:
+        ScenarioError: LeRobot has no such env type.
+    """
+    kind = name.removeprefix(f"{FAMILY_NAME}_")
+    if kind in KNOWN or kind == HUB_TYPE:
+        return LeRobotPlatform(kind)
+    from lerobot_roborecover.platforms.lerobot.env_config import base_types
+
+    types = {member_name(t): t for t in base_types()}
+    if name not in types:
+        raise ScenarioError(
+            f"LeRobot has no env type {kind!r:.80}{nearest(kind, set(types.values()))}; there are "
+            f"{', '.join(sorted(types.values()))}. Is the package that brings it installed?"
+        )
+    return LeRobotPlatform(types[name])
+
+
+def _asked_of_lerobot(env_type: str) -> EnvFacts:
+    """Facts of a type from LeRobot's own config of it; imports LeRobot."""
+    from lerobot_roborecover.platforms.lerobot.env_config import default_base, source_of
+
+    if env_type == HUB_TYPE:
+        raise SimulatorError(
+            "an environment of the Hub is named with --env.base.hub_path=user/name@commit (and "
+            "--env.trust_remote_code=true)"
+        )
+    base = default_base(env_type)
+    source = source_of(base)
+    return EnvFacts(
+        package=source.package,
+        title=f"LeRobot's {env_type}",
+        tasks={base.task: ""} if source.package and base.task else {},
+        horizon=int(getattr(base, "episode_length", None) or 300),
+        control_hz=float(base.fps),
+        action_names=(),
+        kwargs=source.kwargs,
+        state_width=0,
+    )
