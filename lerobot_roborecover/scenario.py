@@ -239,8 +239,9 @@ class Reset:
             ScenarioError: a value is not usable.
             TypeError: a name is none of them.
         """
-        fixtures = {n: Pose.of(v) for n, v in (values.get("fixtures") or {}).items()}
-        return cls(**{**values, "fixtures": fixtures})
+        given: dict[str, Any] = dict(values)
+        given["fixtures"] = {n: Pose.of(v) for n, v in (values.get("fixtures") or {}).items()}
+        return cls(**given)
 
 
 @dataclass(frozen=True)

@@ -126,8 +126,8 @@ class Platform:
     """Half-widths of the disturbance of an action's leading values, in their own units: the paper's, of
     normalised translations."""
     env_name: ClassVar[str] = ""
-    """The env type is `roborecover_<env_name>`, where that is not the platform's name: one that serves several
-    platforms."""
+    """The env type is `roborecover_<env_name>`, where that is not the platform's name: one that serves
+    several platforms."""
     env_defaults: ClassVar[Mapping[str, Any]] = {}
     """Options of that env type that name this platform, nested as in a configuration file."""
 

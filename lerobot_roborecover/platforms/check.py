@@ -77,8 +77,8 @@ class Trace:
             one, two = self.parts[step], other.parts[step]
             which = f" in {', '.join(n for n in one if one[n] != two.get(n))}"
         return (
-            f"states differ{which} from step {step} of {len(self.hashes) - 1} on; at the end bodies are up to "
-            f"{max(away, default=0.0):.4g} mm away"
+            f"states differ{which} from step {step} of {len(self.hashes) - 1} on; at the end bodies are up "
+            f"to {max(away, default=0.0):.4g} mm away"
         )
 
 

@@ -22,7 +22,6 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
-from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.env.configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.env.facts import facts_of
@@ -32,6 +31,7 @@ from lerobot_roborecover.env.processors import env_processors
 from lerobot_roborecover.env.render_device import egl_devices, render_environment
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario

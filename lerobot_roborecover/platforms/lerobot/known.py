@@ -40,17 +40,17 @@ class EnvFacts:
     perturbation: tuple[float, ...] = ()
     """Half-widths of the disturbance of an action's leading values, in the env's own units."""
     exact_snapshots: bool = False
-    """A restored snapshot continues bit for bit: the environment's Python keeps nothing beside its physics."""
+    """A restored snapshot continues bit for bit: Python keeps nothing beside the physics."""
     scenarios: str = ""
     """Shipped set."""
     experts: Mapping[str, Expert] = field(default_factory=dict)
 
 
-def _pusher(patience: int, hurry: float, about: str) -> Expert:
+def _pusher(speed: float, error: float, about: str) -> Expert:
     def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
         from lerobot_roborecover.platforms.lerobot.pusht import Pusher
 
-        return Pusher(simulator.env.unwrapped, rng, patience=patience, hurry=hurry)
+        return Pusher(simulator.env.unwrapped, rng, speed=speed, error=error)
 
     return Expert(make, about)
 
@@ -81,8 +81,9 @@ KNOWN: Mapping[str, EnvFacts] = {
         perturbation=(80.0, 80.0),
         scenarios="pusht_starter",
         experts={
-            "expert": _pusher(0, 1.0, "plans its pushes in a copy of the simulator"),
-            "expert_hurried": _pusher(0, 2.5, "pushes two and a half times as fast as it plans"),
+            "expert": _pusher(1.0, 0.0, "plans its pushes in a copy of the simulator"),
+            "expert_hurried": _pusher(2.5, 0.0, "pushes two and a half times as fast as it plans"),
+            "expert_biased": _pusher(1.0, 12.0, "sees the block some 1.5 cm off"),
         },
     ),
     "aloha": EnvFacts(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, ClassVar
 
-from lerobot_roborecover.platforms.base import Expert, Platform
+from lerobot_roborecover.platforms.base import Platform
 from lerobot_roborecover.platforms.lerobot.known import KNOWN, EnvFacts
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, registered_tasks
 from lerobot_roborecover.platforms.names import nearest
@@ -22,43 +22,18 @@ _WIDEST = 64
 
 
 class LeRobotPlatform(Platform):
-    """One env type, `lerobot_<type>`; tasks have the type as their suite.
-
-    Args:
-        env_type: LeRobot's name.
-    """
+    """One env type, `lerobot_<type>`; tasks have the type as their suite. `member` makes a subclass each."""
 
     simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
     extra = "gym"
     env_name = FAMILY_NAME
-
-    def __init__(self, env_type: str):
-        self.env_type = env_type
-        self.name = member_name(env_type)
-        self.env_defaults = {"base": {"type": env_type}}
-        known = KNOWN.get(env_type)
-        self.title = known.title if known else f"LeRobot's {env_type}"
-        self.action_widths = (len(known.action_names),) if known else tuple(range(1, _WIDEST + 1))
-        self.action_bound = float("inf")
-        self.action_names = {len(known.action_names): known.action_names} if known else {}
-        self.required_versions = {"lerobot": ("0.6.1",), **known.versions} if known else {}
-        self.default_scenarios = known.scenarios if known else ""
-        self.experts: Mapping[str, Expert] = known.experts if known else {}
-        self.perturbation = known.perturbation if known else ()
-        self.perturbable = bool(self.perturbation)
-        self.why_not_perturbable = (
-            f"nobody has said how far an action of env type {env_type} may be disturbed in its own units"
-        )
+    env_type: ClassVar[str]
+    """LeRobot's name; of a type that is not known, as the platform's name has it until LeRobot is asked."""
 
     @cached_property
     def facts(self) -> EnvFacts:
         """Of the type; asks LeRobot's own config where it is not a known one."""
-        return KNOWN.get(self.env_type) or _asked_of_lerobot(self.env_type)
-
-    @property
-    def control_hz(self) -> float:  # ty: ignore[invalid-attribute-override] - of one that LeRobot must be asked
-        """`fps` of LeRobot's config."""
-        return self.facts.control_hz
+        return KNOWN.get(self.env_type) or _asked_of_lerobot(type_named(self.name))
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
         """Those that the type's package registers, or that its config makes."""
@@ -187,7 +162,38 @@ def member_name(env_type: str) -> str:
 
 @cache
 def member(name: str) -> LeRobotPlatform:
-    """A member by its platform name.
+    """A member by its platform name. Whether LeRobot has the type is asked where its facts are needed: that
+    takes fifteen seconds.
+
+    Args:
+        name: `lerobot_<type>`.
+    """
+    kind = name.removeprefix(f"{FAMILY_NAME}_")
+    known = KNOWN.get(kind)
+    width = len(known.action_names) if known else 0
+    members = {
+        "name": name,
+        "env_type": kind,
+        "title": known.title if known else f"LeRobot's {kind}",
+        "env_defaults": {"base": {"type": kind}},
+        "control_hz": known.control_hz if known else float("nan"),
+        "action_widths": (width,) if known else tuple(range(1, _WIDEST + 1)),
+        "action_bound": float("inf"),
+        "action_names": {width: known.action_names} if known else {},
+        "required_versions": {"lerobot": ("0.6.1",), **known.versions} if known else {},
+        "default_scenarios": known.scenarios if known else "",
+        "experts": known.experts if known else {},
+        "perturbation": known.perturbation if known else (),
+        "perturbable": bool(known and known.perturbation),
+        "why_not_perturbable": (
+            f"nobody has said how far an action of env type {kind} may be disturbed in its own units"
+        ),
+    }
+    return type("LeRobotMember", (LeRobotPlatform,), members)()
+
+
+def type_named(name: str) -> str:
+    """LeRobot's name of the env type of a member that is not known; imports LeRobot.
 
     Args:
         name: `lerobot_<type>`.
@@ -195,18 +201,16 @@ def member(name: str) -> LeRobotPlatform:
     Raises:
         ScenarioError: LeRobot has no such env type.
     """
-    kind = name.removeprefix(f"{FAMILY_NAME}_")
-    if kind in KNOWN or kind == HUB_TYPE:
-        return LeRobotPlatform(kind)
     from lerobot_roborecover.platforms.lerobot.env_config import base_types
 
     types = {member_name(t): t for t in base_types()}
     if name not in types:
+        kind = name.removeprefix(f"{FAMILY_NAME}_")
         raise ScenarioError(
-            f"LeRobot has no env type {kind!r:.80}{nearest(kind, set(types.values()))}; there are "
-            f"{', '.join(sorted(types.values()))}. Is the package that brings it installed?"
+            f"LeRobot has no env type {kind!r:.80}{nearest(kind, set(types.values()))}. Is the package that "
+            "brings it installed?"
         )
-    return LeRobotPlatform(types[name])
+    return types[name]
 
 
 def _asked_of_lerobot(env_type: str) -> EnvFacts:

@@ -41,7 +41,15 @@ class LeRobotSimulator:
         exact_snapshots: an environment's Python keeps nothing beside its physics.
     """
 
-    def __init__(self, env_type: str, platform: str, control_hz: float, source: Mapping[str, Any], task: str, exact_snapshots: bool = False):
+    def __init__(
+        self,
+        env_type: str,
+        platform: str,
+        control_hz: float,
+        source: Mapping[str, Any],
+        task: str,
+        exact_snapshots: bool = False,
+    ):
         self.env_type, self.platform, self.control_hz = env_type, platform, control_hz
         self.snapshot_is_exact = exact_snapshots
         self._source = EnvSource.of(source)

@@ -1,4 +1,4 @@
-"""Where a Gymnasium environment comes from, as plain JSON that travels to a worker, and how it is made there."""
+"""Where a Gymnasium environment comes from, as plain JSON that travels to a worker; and how it is made."""
 
 from __future__ import annotations
 
@@ -65,10 +65,7 @@ def make_env(source: EnvSource, task: str) -> gym.Env:
         SimulatorError: it cannot be imported or made.
     """
     try:
-        if source.package:
-            env = _registered(source, task)
-        else:
-            env = _of_lerobot(source, task)
+        env = (_registered if source.package else _of_lerobot)(source, task)
     except SimulatorError:
         raise
     except Exception as err:  # whatever somebody else's environment raises
@@ -107,9 +104,10 @@ def _registered(source: EnvSource, task: str) -> gym.Env:
     if name not in gym.registry:
         there = registered_tasks(source.package)
         if task not in there:
-            known = f"{nearest(task, there)}; there are {', '.join(there)}" if there else ""
+            known = nearest(task, set(there)) if there else ""
             raise SimulatorError(f"{source.package} registers no task {task!r:.120}{known}")
-    return gym.make(name, **{"disable_env_checker": True, **source.kwargs, "max_episode_steps": -1})
+    options: dict[str, Any] = {"disable_env_checker": True, **source.kwargs, "max_episode_steps": -1}
+    return gym.make(name, **options)
 
 
 def _of_lerobot(source: EnvSource, task: str) -> gym.Env:

@@ -21,6 +21,8 @@ _HAND = re.compile(r"(^|[/_.-])(eef|tcp|end_?effector|gripper(_?(link|base|site)
 _NESTED = ("_env", "env", "sim", "_sim", "physics", "simulator")
 """Attributes behind which environments keep the simulator they wrap."""
 _DEPTH = 4
+_FREE_JOINT = 0
+"""`mujoco.mjtJoint.mjJNT_FREE`."""
 
 
 class EnvState(Protocol):
@@ -187,7 +189,7 @@ class PairState:
 
 
 class ObservationState:
-    """Of an environment that shows nothing else: its observation, pictures left out, is in the hash anyway."""
+    """Of an environment that shows nothing else than its observation, which is in the hash anyway."""
 
     kind = "the observation alone"
 
@@ -256,9 +258,9 @@ def physics_of(env: gym.Env) -> Any:
     """dm_control's physics behind an environment; None where there is none."""
     for found in _objects(env.unwrapped):
         for physics in (found, vars_of(found).get("_physics")):
-            if type(physics).__module__.startswith("dm_control"):
-                if hasattr(physics, "model") and hasattr(physics, "render"):
-                    return physics
+            dm = type(physics).__module__.startswith("dm_control")
+            if dm and hasattr(physics, "model") and hasattr(physics, "render"):
+                return physics
     return None
 
 
@@ -277,10 +279,8 @@ def _mujoco_pair(found: Any) -> tuple[Any, Any] | None:
 
 
 def _floats(model: Any, body: int) -> bool:
-    import mujoco
-
     first = int(model.body_jntadr[int(model.body_rootid[body])])
-    return first >= 0 and int(model.jnt_type[first]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    return first >= 0 and int(model.jnt_type[first]) == _FREE_JOINT
 
 
 def _last_of_longest_chain(model: Any) -> int:

@@ -1,0 +1,1 @@
+"""How the PushT starter set and its two policies were made."""
