@@ -1,4 +1,4 @@
-"""A scripted driver for gym_aloha's transfer task: the right arm picks the cube up and hands it to the left."""
+"""A scripted driver for gym_aloha's transfer task: the right arm picks the cube up and hands it over."""
 
 from __future__ import annotations
 
@@ -55,19 +55,19 @@ class Transfer:
                 (90, cube + 0.08 * up, pick, _OPEN),
                 (130, cube - 0.015 * up, pick, _OPEN),
                 (170, cube - 0.015 * up, pick, _CLOSED),
-                (200, _MEET_M + [0.05, 0.0, 0.0], pick, _CLOSED),
+                (200, _MEET_M + np.array([0.05, 0.0, 0.0]), pick, _CLOSED),
                 (220, _MEET_M, pick, _CLOSED),
                 (310, _MEET_M, pick, _OPEN),
-                (360, _MEET_M + [0.1, 0.0, 0.0], pick, _OPEN),
-                (400, _MEET_M + [0.1, 0.0, 0.0], pick, _OPEN),
+                (360, _MEET_M + np.array([0.1, 0.0, 0.0]), pick, _OPEN),
+                (400, _MEET_M + np.array([0.1, 0.0, 0.0]), pick, _OPEN),
             ],
             "left": [
                 (0, begin["left"], upright, _CLOSED),
-                (100, _MEET_M + [-0.1, 0.0, -0.02], meet, _OPEN),
-                (260, _MEET_M + [0.02, 0.0, -0.02], meet, _OPEN),
-                (310, _MEET_M + [0.02, 0.0, -0.02], meet, _CLOSED),
-                (360, _MEET_M + [-0.1, 0.0, -0.02], upright, _CLOSED),
-                (400, _MEET_M + [-0.1, 0.0, -0.02], upright, _CLOSED),
+                (100, _MEET_M + np.array([-0.1, 0.0, -0.02]), meet, _OPEN),
+                (260, _MEET_M + np.array([0.02, 0.0, -0.02]), meet, _OPEN),
+                (310, _MEET_M + np.array([0.02, 0.0, -0.02]), meet, _CLOSED),
+                (360, _MEET_M + np.array([-0.1, 0.0, -0.02]), upright, _CLOSED),
+                (400, _MEET_M + np.array([-0.1, 0.0, -0.02]), upright, _CLOSED),
             ],
         }
 

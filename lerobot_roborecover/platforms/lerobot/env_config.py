@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from lerobot.configs import FeatureType, PolicyFeature
@@ -29,11 +29,9 @@ class EnvHubConfig(HubEnvConfig):
 
     episode_length: int = 300
     """Steps of a trial."""
-    gym_kwargs: dict = field(default_factory=dict)
-    """Not used: the repository's own `make_env` decides."""
 
 
-class BaseEnvConfig(EnvConfig):
+class BaseEnvConfig(draccus.ChoiceRegistry):
     """The env types that can be a base: LeRobot's and third parties', and `hub`; none of ours."""
 
     @classmethod
@@ -94,6 +92,12 @@ def _plain(encoded: Any) -> dict[str, Any]:
     return {k: v for k, v in encoded.items() if k not in ("features", "features_map")}
 
 
+if TYPE_CHECKING:
+    _Base = EnvConfig
+else:
+    _Base = BaseEnvConfig  # what draccus chooses from: the env types, without those of ours
+
+
 def _pusht() -> EnvConfig:
     return PushtEnv(obs_type=KNOWN["pusht"].kwargs["obs_type"])
 
@@ -102,7 +106,7 @@ def _pusht() -> EnvConfig:
 class LeRobotConfig(EnvConfig, FilmedEnvConfig):
     """Recovery scenarios on any env type of LeRobot's."""
 
-    base: BaseEnvConfig = field(default_factory=_pusht)  # ty: ignore[invalid-assignment] - a choice of them
+    base: _Base = field(default_factory=_pusht)
     """The env type, `--env.base.type=NAME`, and its own options, `--env.base.OPTION=VALUE`."""
     obs_type: str = ""
     """In place of the base's own; `state` stands for what it has without pictures."""
@@ -112,8 +116,7 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
     def __post_init__(self):
         if self.obs_type:
             self.base = self._with_obs_type(self.obs_type)
-        if isinstance(self.base, HubEnvConfig) and not self.base.features:
-            self._ask_the_environment()
+        self._problem = self._ask_the_environment() if isinstance(self.base, HubEnvConfig) else ""
         self.obs_type = _kind_of(self.base)
         self.task, self.fps = self.base.task, self.base.fps
         self.features, self.features_map = self.base.features, self.base.features_map
@@ -132,13 +135,22 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
         except Exception as err:
             raise OptionError(f"--env.obs_type={wanted}: env type {name}: {err!s:.200}") from None
 
-    def _ask_the_environment(self) -> None:
-        """A repository on the Hub says nothing of its features; its environment does."""
+    def _ask_the_environment(self) -> str:
+        """A repository on the Hub says nothing of its features; its environment does.
+
+        Returns:
+            Why it could not be asked. LeRobot's parser hides what is raised while it parses.
+        """
         from lerobot_roborecover.platforms.lerobot.source import make_env
 
         assert isinstance(self.base, HubEnvConfig)
-        self._check_hub()
-        env = make_env(source_of(self.base), self.base.task or "")
+        if self.base.features:
+            return ""
+        try:
+            self._check_hub()
+            env = make_env(source_of(self.base), self.base.task or "")
+        except (OptionError, SimulatorError) as err:
+            return str(err)
         try:
             space, acts = env.observation_space, env.action_space
             shape = acts.shape or ()
@@ -158,6 +170,7 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
         finally:
             env.close()
         self.base.features, self.base.features_map = features, names
+        return ""
 
     def _check_hub(self) -> None:
         assert isinstance(self.base, HubEnvConfig)
@@ -189,9 +202,16 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
         """
         if isinstance(self.base, HubEnvConfig):
             self._check_hub()
+        if self._problem:
+            raise OptionError(f"--env.base: {self._problem}")
         kwargs = self.gym_kwargs
         picture = no_video if self.obs_type == "state" and not self.videos else None
         kind = BaseEnvConfig.get_choice_name(type(self.base))
+        if set(self.features) <= {ACTION}:
+            raise OptionError(
+                f"--env.base.obs_type={getattr(self.base, 'obs_type', '')}: with it, env type {kind} gives a "
+                "policy nothing to see"
+            )
         decisive = {**kwargs, "env_type": kind}
         return SimulatorSetup(kwargs, decisive, picture, platform=member_name(kind))
 

@@ -55,11 +55,11 @@ def _pusher(speed: float, error: float, about: str) -> Expert:
     return Expert(make, about)
 
 
-def _transfer(slip_m: float, about: str) -> Expert:
+def _transfer(error_m: float, about: str) -> Expert:
     def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
         from lerobot_roborecover.platforms.lerobot.aloha import Transfer
 
-        return Transfer(simulator.env.unwrapped, rng, slip_m=slip_m)
+        return Transfer(simulator.env.unwrapped, rng, error_m=error_m)
 
     return Expert(make, about)
 
@@ -102,7 +102,7 @@ KNOWN: Mapping[str, EnvFacts] = {
         perturbation=(0.0,) * 7 + (0.15,) * 6,
         exact_snapshots=True,
         experts={
-            "expert": _transfer(0.0, "transfers the cube (AlohaTransferCube-v0 alone)"),
+            "expert": _transfer(0.0, "transfers the cube, in half of its trials"),
             "expert_biased": _transfer(0.03, "the same, and sees the cube up to 3 cm off"),
         },
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any, ClassVar
 
@@ -78,21 +79,26 @@ class LeRobotPlatform(Platform):
         """
         given = dict(options)
         given.pop("instruction", None)
+        seen = {name: given.pop(name) for name in _SEEN if name in given}
         if "source" not in given:
-            given = {**self._plain_source(given), **{k: v for k, v in given.items() if k in _OWN}}
+            facts = self.facts
+            task = next(iter(facts.tasks), "") or next(iter(registered_tasks(facts.package)), "")
+            given = {**given, "source": EnvSource(facts.package, facts.kwargs).as_options(), "task": task}
+        given["source"] = self._seen_as(EnvSource.of(given["source"]), seen).as_options()
         given.setdefault("control_hz", self.facts.control_hz)
         given.setdefault("exact_snapshots", self.facts.exact_snapshots)
         return super().make_simulator(env_type=self.env_type, platform=self.name, **given)
 
-    def _plain_source(self, options: Mapping[str, Any]) -> dict[str, Any]:
-        facts = self.facts
-        kwargs = dict(facts.kwargs)
-        if options.get("obs_type", "state") != "state":
-            kwargs["obs_type"] = options["obs_type"]
-        if self.env_type in KNOWN:
-            kwargs |= {k: v for k, v in options.items() if k in _PICTURES}
-        task = next(iter(facts.tasks), "") or next(iter(registered_tasks(facts.package)), "")
-        return {"source": EnvSource(package=facts.package, kwargs=kwargs).as_options(), "task": task}
+    def _seen_as(self, source: EnvSource, wanted: Mapping[str, Any]) -> EnvSource:
+        """The source with other observations, as far as its environment has them."""
+        known = KNOWN.get(self.env_type)
+        if known and wanted.get("obs_type") == "state":
+            wanted = {**wanted, "obs_type": known.kwargs["obs_type"]}
+        kwargs = {k: v for k, v in wanted.items() if known or k in source.kwargs}
+        config = {k: v for k, v in wanted.items() if k in source.config}
+        if source.package:
+            return replace(source, kwargs={**source.kwargs, **kwargs})
+        return replace(source, config={**source.config, **config}) if source.config else source
 
     def picture_options(self, size: int) -> dict[str, Any]:
         """Of PushT and Aloha; other types draw as large as they please."""
@@ -112,8 +118,11 @@ class LeRobotPlatform(Platform):
         return FAMILY.env_config()
 
 
-_OWN = ("control_hz",)
-_PICTURES = ("observation_height", "observation_width", "visualization_height", "visualization_width")
+_SEEN = (
+    "obs_type",
+    *(f"{what}_{side}" for what in ("observation", "visualization") for side in ("height", "width")),
+)
+"""Options of environments that decide what is seen of them, and no physics."""
 
 
 class LeRobotFamily(Platform):

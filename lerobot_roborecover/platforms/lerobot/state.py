@@ -142,17 +142,21 @@ class PymunkState:
         raise SimulatorError("pymunk's solver remembers contacts that cannot be read: replay instead")
 
     def bodies(self, observation: Observation) -> dict[str, Pose]:
-        """On the plane z = 0, y downwards as in the picture. Where the environment has a `goal_pose`, marks
-        of the body that is not the agent."""
+        """On the plane z = 0, y downwards as in the picture. Where the environment has a `goal_pose`, the
+        middle of the one body that is not the agent, and where that belongs."""
         found = {
             "eef" if name == "agent" else name: self._pose(*b.position, b.angle)
             for name, b in self._named().items()
         }
         goal = getattr(self._inner, "goal_pose", None)
-        objects = [n for n in found if n != "eef"]
+        objects = [n for n in self._named() if n != "agent"]
         if goal is not None and len(objects) == 1:
-            found[objects[0] + HANDLE] = found[objects[0]]
-            found[GOAL] = self._pose(*map(float, goal))
+            body = self._named()[objects[0]]
+            x, y = body.center_of_gravity
+            found[objects[0] + HANDLE] = self._pose(*body.local_to_world((x, y)), body.angle)
+            gx, gy, angle = map(float, goal)
+            c, s = np.cos(angle), np.sin(angle)
+            found[GOAL] = self._pose(gx + c * x - s * y, gy + s * x + c * y, angle)
         return found
 
     def _pose(self, x: float, y: float, angle: float) -> Pose:
