@@ -83,7 +83,7 @@ say "installing Python packages in .venv (some GB the first time)"
 install_python_packages() {
     # Compiled once, here: where PYTHONDONTWRITEBYTECODE is set, as in many images, every process would compile all of
     # LeRobot and torch anew, which takes it half a minute.
-    "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -c constraints.txt -e '.[libero,robotwin,test]'
+    "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -c constraints.txt -e '.[gym,libero,robotwin,test]'
 }
 install_python_packages || { sleep 5; install_python_packages; }
 echo "$wanted" >"$stamp"

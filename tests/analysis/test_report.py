@@ -205,7 +205,7 @@ def test_sparse_cells_are_marked_and_stay(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("success", [True, False])
+@pytest.mark.parametrize("success", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_all_successes_and_all_failures(tmp_path, success):
     arms = [(policy, start) for policy in "ab" for start in ("recovery", "initial")]
     rows = [

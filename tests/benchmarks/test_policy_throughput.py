@@ -37,10 +37,11 @@ BACKBONE = {
         pytest.param(
             "pi05", {"image_resolution": [32, 32], "num_inference_steps": 2}, marks=pytest.mark.nightly
         ),
-        (
+        pytest.param(
             "smolvla",
             {"resize_imgs_with_padding": [32, 32], "num_steps": 2, "num_vlm_layers": 2,
              "self_attn_every_n_layers": 2},
+            marks=pytest.mark.nightly,
         ),
     ],
 )  # fmt: skip

@@ -41,6 +41,7 @@ def short(tmp_path, name: str, count: int, horizon: int):
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.metaworld
 @pytest.mark.slow
 def test_metaworld(tmp_path):

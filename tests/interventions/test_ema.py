@@ -90,6 +90,7 @@ def arguments(donors: Path, base: Path, out: Path) -> list[str]:
     ]  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_correction_act_trains_saves_resumes_and_exports(donors, tmp_path, capsys):
     import torch
     from lerobot.configs.policies import PreTrainedConfig

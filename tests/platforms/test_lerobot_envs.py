@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 import time
 import types
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +23,8 @@ from lerobot_roborecover.platforms.lerobot.simulator import LeRobotSimulator
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, check_hub
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import DeviationType, Reset, Rollout, Scenario, Source, Stage, Task
+from tests.support.hub_client import HubClient
+from tests.support.hub_server import HubServer, Repo
 
 pytest.importorskip("gym_pusht", reason="pip install 'lerobot_env_roborecover[gym]'")
 
@@ -287,6 +291,46 @@ def test_a_base_that_cannot_be_used_is_refused(options, says):
 def test_a_moving_branch_of_the_hub_is_refused():
     with pytest.raises(SimulatorError, match="40 hex digits"):
         check_hub("lab/env@main")
+
+
+HUB = """
+import json, sys
+import numpy as np
+from lerobot_roborecover.curation.policy_trials import env_config
+from lerobot_roborecover.platforms import make_simulator, platform_named
+from lerobot_roborecover.scenario import Reset
+given = ["--base.type=hub", f"--base.hub_path={sys.argv[1]}", "--trust_remote_code=true"]
+config = env_config("lerobot", "none", given)
+slot = config.run_spec().slot
+simulator = make_simulator(slot.platform, **slot.options)
+(task,) = platform_named(slot.platform).tasks(config.gym_kwargs)
+hashes = []
+for _ in range(2):
+    simulator.reset(task, Reset(seed=5))
+    for _ in range(30):
+        simulator.step(np.ones(2))
+    hashes.append(simulator.state_sha256())
+print(json.dumps({
+    "features": sorted(config.features), "task": [task.suite, task.name], "same": len(set(hashes)) == 1,
+    "solved": simulator.succeeded(), "marks": simulator.fingerprint(),
+}))
+"""
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_an_environment_on_the_hub_at_a_commit(tmp_path):
+    with HubServer() as hub:
+        hub.repos["lab/point"] = repo = Repo()
+        code = (Path(__file__).parents[1] / "support" / "hub_env.py").read_bytes()
+        sha = repo.commit({"env.py": code})
+        done = HubClient(hub, tmp_path, tmp_path).run(HUB, f"lab/point@{sha}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["features"] == ["action", "agent_pos"]
+    assert found["same"]
+    assert found["solved"]
+    assert found["marks"]["env.hub"] == f"lab/point@{sha}"
 
 
 @pytest.mark.lerobot

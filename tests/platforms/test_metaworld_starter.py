@@ -61,6 +61,7 @@ def test_every_handoff_is_identical_after_the_others(shipped):
     simulator.close()
 
 
+@pytest.mark.nightly
 def test_a_recorded_proof_still_recovers(shipped):
     """One scenario per proving controller; the others differ in nothing but the seed."""
     from lerobot_roborecover.platforms.metaworld.experts import expert, patient_expert

@@ -50,6 +50,7 @@ def test_it_keeps_the_contract(environment):
     assert {"to-the-ship: replay", "to-the-quay: replay in a fresh process", "imports of a worker"} < names
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_collect_screen_eval_and_report(environment, tmp_path):

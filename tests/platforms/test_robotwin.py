@@ -254,6 +254,7 @@ def test_every_quality_gives_lerobots_observation_and_the_same_physics(simulator
     assert (pictures["trivial"] != pictures["default"]).any()
 
 
+@pytest.mark.nightly
 @on_standin
 def test_end_effector_actions_with_curobo(tmp_path):
     """In a process of its own, because a stand-in for curobo stays imported."""

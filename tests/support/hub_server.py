@@ -147,7 +147,7 @@ class _Handler(BaseHTTPRequestHandler):
             (rf"/api/datasets/{repo_id}(?:/revision/(?P<rev>[^/]+))?", self._info),
             (rf"/api/datasets/{repo_id}/tree/(?P<rev>[^/]+)(?:/.*)?", self._tree),
             (rf"/api/datasets/{repo_id}/paths-info/(?P<rev>[^/]+)", self._paths_info),
-            (rf"/datasets/{repo_id}/resolve/(?P<rev>[^/]+)/(?P<file>.+)", self._resolve),
+            (rf"(?:/datasets)?/{repo_id}/resolve/(?P<rev>[^/]+)/(?P<file>.+)", self._resolve),
         ):
             if match := re.fullmatch(pattern, path):
                 names = match.groupdict()

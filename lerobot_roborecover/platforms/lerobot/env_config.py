@@ -186,7 +186,10 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
+        """Options of the simulator, and the horizon of its tasks."""
+        return {**self._options(), "horizon": getattr(self.base, "episode_length", None)}
+
+    def _options(self) -> dict[str, Any]:
         source = source_of(self.base).as_options()
         return {"source": source, "task": self.base.task or "", "control_hz": float(self.base.fps)}
 
@@ -204,7 +207,7 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
             self._check_hub()
         if self._problem:
             raise OptionError(f"--env.base: {self._problem}")
-        kwargs = self.gym_kwargs
+        kwargs = self._options()
         picture = no_video if self.obs_type == "state" and not self.videos else None
         kind = BaseEnvConfig.get_choice_name(type(self.base))
         if set(self.features) <= {ACTION}:

@@ -38,12 +38,13 @@ class LeRobotPlatform(Platform):
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
         """Those that the type's package registers, or that its config makes."""
-        source = EnvSource.of((options or {}).get("source") or {})
-        names = dict(self.facts.tasks)
+        given = dict(options or {})
+        source = EnvSource.of(given.get("source") or {})
         if source.hub or source.config:
-            names = {str((options or {}).get("task", "")): str((options or {}).get("instruction", ""))}
-        elif not names:
-            names = dict.fromkeys(registered_tasks(self.facts.package), "")
+            name = str(given.get("task", "")) or source.name
+            horizon = given.get("horizon") or self.facts.horizon
+            return [Task(self.name, self.env_type, name, name, int(horizon))]
+        names = dict(self.facts.tasks) or dict.fromkeys(registered_tasks(self.facts.package), "")
         return [self._task(name, said) for name, said in names.items()]
 
     def _task(self, name: str, instruction: str = "") -> Task:
@@ -77,16 +78,17 @@ class LeRobotPlatform(Platform):
             options: `source`, `task` and `control_hz` of `LeRobotSimulator`, as an env config gives them; or
                 `obs_type` and the size of pictures, for a known type.
         """
-        given = dict(options)
-        given.pop("instruction", None)
+        given: dict[str, Any] = dict(options)
         seen = {name: given.pop(name) for name in _SEEN if name in given}
         if "source" not in given:
             facts = self.facts
             task = next(iter(facts.tasks), "") or next(iter(registered_tasks(facts.package)), "")
             given = {**given, "source": EnvSource(facts.package, facts.kwargs).as_options(), "task": task}
         given["source"] = self._seen_as(EnvSource.of(given["source"]), seen).as_options()
-        given.setdefault("control_hz", self.facts.control_hz)
-        given.setdefault("exact_snapshots", self.facts.exact_snapshots)
+        known = KNOWN.get(self.env_type)
+        if "control_hz" not in given:
+            given["control_hz"] = self.facts.control_hz
+        given.setdefault("exact_snapshots", bool(known and known.exact_snapshots))
         return super().make_simulator(env_type=self.env_type, platform=self.name, **given)
 
     def _seen_as(self, source: EnvSource, wanted: Mapping[str, Any]) -> EnvSource:

@@ -36,6 +36,11 @@ class EnvSource:
         """From the plain values of `as_options`."""
         return cls(**options)
 
+    @property
+    def name(self) -> str:
+        """A task's, where the environment has none."""
+        return self.hub.partition("@")[0].replace("/", ".") or str(self.config.get("type", ""))
+
     def as_options(self) -> dict[str, Any]:
         """Plain values."""
         return {key: value for key, value in asdict(self).items() if value}
