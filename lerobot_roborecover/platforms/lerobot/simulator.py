@@ -76,6 +76,7 @@ class LeRobotSimulator:
                 f"env type {self.env_type}: its action space is {space}; recorded actions are vectors, "
                 "Box(shape=(A,))"
             )
+        self._low, self._high = space.low, space.high
         return space
 
     @property
@@ -131,12 +132,8 @@ class LeRobotSimulator:
         if self._ended:
             return
         action = np.asarray(action)
-        space = self._space
-        if action.shape != space.shape or not np.isfinite(action).all():
-            raise SimulatorError(
-                f"an action of env type {self.env_type} is {space.shape[0]} finite numbers, got shape "
-                f"{action.shape}: {action}"
-            )
+        if action.shape != self._low.shape or not ((action >= self._low) & (action <= self._high)).all():
+            self._outside(action)
         with self._unseen:
             seen, _, terminated, _, info = self._step(action)
         try:
@@ -147,17 +144,26 @@ class LeRobotSimulator:
                 ", and no is_success, which is what LeRobot counts"
             ) from None
         self._take(seen)
-        if not self._warned and ((action < space.low) | (action > space.high)).any():
-            self._warned = True
-            _LOG.warning(
-                "env type %s: action %s is outside %s; passed on as it is, as lerobot-eval does (said once)",
-                self.env_type, action, space,
-            )  # fmt: skip
         if terminated and not self._success:
             self._ended = True
             _LOG.warning(
                 "env type %s: task %s ended by itself without success; no action changes it any more",
                 self.env_type, self._task,
+            )  # fmt: skip
+
+    def _outside(self, action: np.ndarray) -> None:
+        """Refuses what is no action; says once that one is outside the space."""
+        space = self._space
+        if action.shape != space.shape or not np.isfinite(action).all():
+            raise SimulatorError(
+                f"an action of env type {self.env_type} is {space.shape[0]} finite numbers, got shape "
+                f"{action.shape}: {action}"
+            )
+        if not self._warned:
+            self._warned = True
+            _LOG.warning(
+                "env type %s: action %s is outside %s; passed on as it is, as lerobot-eval does (said once)",
+                self.env_type, action, space,
             )  # fmt: skip
 
     def _take(self, seen: Any) -> None:
