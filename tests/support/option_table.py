@@ -53,7 +53,7 @@ def lerobots_options() -> dict[str, Options]:
         "serve": _of_class(ServeConfig, "--"),
         **{
             f"--env.type={ENV_PREFIX}{name}": _of_class(ENV_TYPES[name], "--env.", RecoveryOptions)
-            for name in ("fake", "libero", "metaworld", "robotwin")
+            for name in ("fake", "lerobot", "libero", "metaworld", "robotwin")
         },
         "--policy.type=remote": _of_class(RemoteConfig, "--policy."),
         "--policy.type=roborecover_intervention": _of_class(RoboRecoverInterventionConfig, "--policy."),
