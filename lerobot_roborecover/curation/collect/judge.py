@@ -12,6 +12,7 @@ from lerobot_roborecover.curation.collect.exclusions import Exclusion, judge, ob
 from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
 from lerobot_roborecover.curation.collect.rollouts import Ended, RolloutBook
 from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.recording import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Outcome
 
@@ -126,4 +127,7 @@ def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging)
             "body": touch.body, "displaced_mm": round(touch.displaced_mm, 2),
             "tilted_deg": round(touch.tilted_deg, 2), "undisturbed": twin.outcome,
         }  # fmt: skip
-    return RolloutVerdict(planned, None, judge(record, skip=judging.skip, only=judging.only), notes)
+    skip = judging.skip
+    if np.isinf(platform_named(planned.task.platform).action_bound):
+        skip = (*skip, "pressing")  # targets, which ask for no direction
+    return RolloutVerdict(planned, None, judge(record, skip=skip, only=judging.only), notes)
