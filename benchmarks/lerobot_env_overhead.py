@@ -53,7 +53,7 @@ def main() -> None:
     low, high = np.percentile(ratios, [25, 75])
     print(
         f"{args.platform}: {statistics.median(ratios):.3f} times a bare step (quartiles {low:.3f} to "
-        f"{high:.3f}, {args.rounds} turns of {args.steps}); bare: {statistics.median(speeds):.0f} steps a second"
+        f"{high:.3f}, {args.rounds} turns of {args.steps}); bare: {statistics.median(speeds):.0f} steps/s"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
 import sys
 import time
 import types
@@ -291,6 +292,20 @@ def test_a_base_that_cannot_be_used_is_refused(options, says):
 def test_a_moving_branch_of_the_hub_is_refused():
     with pytest.raises(SimulatorError, match="40 hex digits"):
         check_hub("lab/env@main")
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pusht", pytest.param("aloha", marks=pytest.mark.nightly)])
+def test_the_whole_chain(name, tmp_path):
+    program = [sys.executable, "-m", "tests.support.outside_chain", str(tmp_path), name]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["candidates"] == 4
+    assert found["lerobot_eval"] == found["roborecover_eval"]  # the same outcomes, to the step
+    assert [scenario for scenario, _, _ in found["lerobot_eval"]] == sorted(found["tested"])
+    assert {outcome for _, outcome, _ in found["lerobot_eval"]} <= {"success", "horizon"}
 
 
 HUB = """
