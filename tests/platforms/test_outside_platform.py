@@ -60,7 +60,7 @@ def test_collect_screen_eval_and_report(environment, tmp_path):
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["candidates"] == 4
     assert found["lerobot_eval"] == found["roborecover_eval"]  # the same outcomes, to the step
-    assert len(found["lerobot_eval"]) == len(found["tested"]) == 3
+    assert (len(found["lerobot_eval"]), len(found["tested"])) == (4, 3)
     assert {outcome for _, outcome, _ in found["lerobot_eval"]} <= {"success", "horizon"}
     page = next(tmp_path.glob("report/*.html")).read_text()
     assert re.search(r"crane", page)

@@ -79,7 +79,7 @@ def run(root: Path, chain: Chain) -> dict:
     final = root / "screened"
     if len(labelled) > 3:
         assert main([
-            "validate", str(final), "--trials-folder", str(root / "screened.trials"), "--runs", "2",
+            "validate", str(final), "--trials-folder", str(root / "screened.trials"), "--runs", "1",
             "--no-frames", "--out", str(root / "validated"),
         ]) == 0  # fmt: skip
         final = root / "split"
