@@ -45,7 +45,7 @@ class Pusher:
     def __init__(self, inner: Any, rng: np.random.Generator, *, speed: float = 1.0, error: float = 0.0):
         self._inner, self._speed = inner, speed
         self._offset = rng.normal(0.0, error, 2) if error else np.zeros(2)
-        self._model = _Model(inner)
+        self._model = PlaneCopy(inner)
         self._way: deque[np.ndarray] = deque()
 
     def __call__(self, t: int) -> np.ndarray:
@@ -108,7 +108,7 @@ def cost(position: np.ndarray, angle: float, goal: np.ndarray) -> float:
     return float(np.linalg.norm(position - goal[:2]) + _TURN * abs(turn))
 
 
-class _Model:
+class PlaneCopy:
     """A copy of the plane, with an agent and a block to push about."""
 
     def __init__(self, inner: Any):
