@@ -19,7 +19,7 @@ from lerobot_roborecover.scenario import Scenario
 
 PINNED = core_type_in_use() == CORE_TYPE
 """This machine rounds as the one that recorded."""
-ROUNDING_MM = {"metaworld": 1e-4, "libero": 0.01, "fake": 0.0}
+ROUNDING_MM = {"metaworld": 1e-4, "libero": 0.01, "lerobot_pusht": 0.0, "fake": 0.0}
 """By platform, where it does not; the bound that decides a handoff is 2 mm."""
 
 _PROGRAM = """

@@ -72,6 +72,11 @@ class Look:
         found = [self.readings[int(f)].get(row, {}).get(value) for f in self.frames()]
         return None if any(v is None for v in found) else np.array(found, dtype=float)
 
+    def grips(self) -> bool:
+        """Whether a gripper is told anything at all."""
+        first = self.readings[int(self.frames()[0])][HAND]
+        return any(name != "speed" for name in first)
+
     def closed(self) -> np.ndarray:
         """(n,) bool: the gripper is told to close; all True where it has no command of its own."""
         first = self.readings[int(self.frames()[0])][HAND]

@@ -82,6 +82,8 @@ class _Seen:
         self._has_goal = goal is not None
         self.hand_m_s = _need(look.values(HAND, "speed"))
         self.closed = look.closed()
+        self.pushes = self._has_goal and not look.grips()
+        """Nothing can be held: what has a place is pushed there."""
         self.held, self.carried = self._grasps()
         self._released = self._releases()
         self.labels = [self._label(i) for i in range(self.n)]
@@ -184,6 +186,8 @@ class _Seen:
         eye, reach = self.eye, self._reach[self.main][i]
         placed = self.goal[i] < eye.place_m
         hand = Stage.CONTACT if reach <= eye.contact_m else Stage.APPROACH
+        if self.pushes:
+            return self._pushed(i, Stage.PLACE if placed else hand)
         if self.held[i]:
             if any(self._moved[name][i] > eye.knocked_m for name in self.others) and self._rests(i):
                 return Stage.PLACE, DeviationType.SCENE_CHANGE
@@ -202,6 +206,15 @@ class _Seen:
         if not self.carried[i] and self._sideways(i) > eye.knocked_m:
             return hand, DeviationType.SCENE_CHANGE
         return (hand, DeviationType.WRONG_POSE) if self._stalled(i) or self._stuck(i) else None
+
+    def _pushed(self, i: int, stage: Stage) -> tuple[Stage, DeviationType] | None:
+        """Of what is pushed to its place: it lies still farther from there than it was, or nothing comes of
+        it any more. That it moves sideways, and is left, is the task."""
+        if not self._rests(i):
+            return None
+        if self.goal[i] - self.goal[: i + 1].min() > self.eye.event_m:
+            return stage, DeviationType.STAGE_ROLLBACK
+        return (stage, DeviationType.WRONG_POSE) if self._stalled(i) or self._stuck(i) else None
 
     def _at_other(self, i: int) -> bool:
         """The hand is at a part that is not to be handled, and has moved it."""

@@ -1,0 +1,42 @@
+"""Copies a trained policy as it ships: weights in half precision, without the training's own settings.
+
+    python -m recipes.pusht.ship CHECKPOINT lerobot_roborecover/data/pusht_policies/NAME
+
+LeRobot loads them into float32 again. The numbers of docs/pusht_starter.md are of what ships.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+
+def ship(checkpoint: Path, out: Path) -> None:
+    """Copies `checkpoint` (a `pretrained_model` folder) to `out`."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    out.mkdir(parents=True, exist_ok=True)
+    for file in sorted(checkpoint.iterdir()):
+        if file.name == "model.safetensors":
+            weights = load_file(file)
+            half = {k: v.half() if v.dtype == torch.float32 else v for k, v in weights.items()}
+            save_file(half, out / file.name, metadata={"format": "pt"})
+        elif file.name != "train_config.json":
+            shutil.copyfile(file, out / file.name)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("out", type=Path)
+    args = parser.parse_args()
+    ship(args.checkpoint, args.out)
+
+
+if __name__ == "__main__":
+    main()
