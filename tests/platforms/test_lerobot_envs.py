@@ -170,8 +170,13 @@ def test_what_cannot_be_rebuilt_is_refused(toys, name, says):
 def test_an_environment_without_success_is_refused(toys):
     simulator = toy("Silent")
     simulator.reset(task_of("Silent"), START)
-    with pytest.raises(SimulatorError, match="holds coverage, and no is_success"):
+    with pytest.raises(SimulatorError, match=r"holds coverage, and no is_success.*--env\.success_key"):
         simulator.step(np.zeros(2))
+    source = EnvSource(package="gym_toy").as_options()
+    named = LeRobotSimulator("toy", "lerobot_toy", 10.0, source, "Silent-v0", success_key="coverage")
+    named.reset(task_of("Silent"), START)
+    named.step(np.zeros(2))
+    assert named.succeeded()
 
 
 def test_an_end_without_success_is_no_success_and_nothing_changes_any_more(toys, caplog):

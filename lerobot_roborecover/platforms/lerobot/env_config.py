@@ -110,6 +110,8 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
     """The env type, `--env.base.type=NAME`, and its own options, `--env.base.OPTION=VALUE`."""
     obs_type: str = ""
     """In place of the base's own; `state` stands for what it has without pictures."""
+    success_key: str = "is_success"
+    """Of a step's info: the environment's own answer, where it is called otherwise. In every trial row."""
     trust_remote_code: bool = False
     """Run the code of `--env.base.type=hub --env.base.hub_path=user/name@commit`."""
 
@@ -191,7 +193,8 @@ class LeRobotConfig(EnvConfig, FilmedEnvConfig):
 
     def _options(self) -> dict[str, Any]:
         source = source_of(self.base).as_options()
-        return {"source": source, "task": self.base.task or "", "control_hz": float(self.base.fps)}
+        known = {"source": source, "task": self.base.task or "", "control_hz": float(self.base.fps)}
+        return known | ({} if self.success_key == "is_success" else {"success_key": self.success_key})
 
     def get_env_processors(self) -> tuple[Any, Any]:
         """The base's."""

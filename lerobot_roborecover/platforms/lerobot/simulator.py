@@ -39,6 +39,7 @@ class LeRobotSimulator:
         source: plain values of `EnvSource`.
         task: whose spaces are shown before the first reset.
         exact_snapshots: an environment's Python keeps nothing beside its physics.
+        success_key: of a step's info, where the environment's own answer is not `is_success`.
     """
 
     def __init__(
@@ -49,9 +50,10 @@ class LeRobotSimulator:
         source: Mapping[str, Any],
         task: str,
         exact_snapshots: bool = False,
+        success_key: str = "is_success",
     ):
         self.env_type, self.platform, self.control_hz = env_type, platform, control_hz
-        self.snapshot_is_exact = exact_snapshots
+        self.snapshot_is_exact, self._success_key = exact_snapshots, success_key
         self._source = EnvSource.of(source)
         self._envs: OrderedDict[str, gym.Env] = OrderedDict()
         self.env: gym.Env = self._env_of(task)
@@ -137,11 +139,12 @@ class LeRobotSimulator:
         with self._unseen:
             seen, _, terminated, _, info = self._step(action)
         try:
-            self._success = bool(info["is_success"])
+            self._success = bool(info[self._success_key])
         except KeyError:
             raise SimulatorError(
                 f"env type {self.env_type}: the info of a step holds {', '.join(map(str, info)) or 'nothing'}"
-                ", and no is_success, which is what LeRobot counts"
+                f", and no {self._success_key}, which is what LeRobot counts. If one of these is the "
+                "task's own success, name it: --env.success_key=NAME"
             ) from None
         self._take(seen)
         if terminated and not self._success:
