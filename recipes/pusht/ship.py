@@ -2,7 +2,7 @@
 
     python -m recipes.pusht.ship CHECKPOINT lerobot_roborecover/data/pusht_policies/NAME
 
-LeRobot loads them into float32 again. The numbers of docs/pusht_starter.md are of what ships.
+LeRobot loads them into float32 again.
 """
 
 from __future__ import annotations
