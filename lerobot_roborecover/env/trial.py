@@ -332,6 +332,7 @@ class Trial:
 
     def _end(self, outcome: Outcome, reason: str = "") -> None:
         self.state, self.outcome, self.reason = TrialState.OVER, outcome, reason
+        self.steps = min(self.steps, self.scenario.task.horizon)  # steps that were taken back come on top
         self.success = outcome is Outcome.SUCCESS
 
     def _leave(self, *states: TrialState, to: TrialState) -> None:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.env.directives import Controller, Directive
@@ -230,8 +230,14 @@ DECISION = st.one_of(
 )
 
 
+_FOUR = ("act", ["plain"] * 4, Controller.BASE)
+_BACK = ("back", 1, Controller.BASE)
+_REFUSED = ("act", ["plain"] * 4 + ["bad"], Controller.BASE)
+
+
 @settings(max_examples=150, deadline=None)
 @given(st.lists(DECISION, min_size=1, max_size=8))
+@example([_FOUR, _BACK, _FOUR, _BACK, ("act", ["plain"], Controller.BASE), _REFUSED])
 def test_a_chunk_counts_as_its_actions_one_by_one(decisions):
     whole, single = live(decisions, whole_chunks=True), live(decisions, whole_chunks=False)
     assert whole.state is single.state

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.candidates import read_candidates
@@ -31,7 +32,7 @@ class Chain:
     """Of it, without `--env.`."""
     collect: Sequence[str]
     """Who drives, and from where."""
-    widths: Mapping[str, int]
+    widths: Mapping[str, Any]
     """Of the policy's inputs and output."""
     horizon: int = 50
 
@@ -49,7 +50,7 @@ CHAINS = {
     "aloha": Chain(
         "roborecover_lerobot", ("base.type=aloha", "base.task=AlohaTransferCube-v0"),
         ("--expert", "expert_biased", "--perturb", "--task", "*Transfer*", "--seeds", "0-3"),
-        {"state": 14, "action": 14}, 40,
+        {"state": 14, "env_state": 0, "action": 14, "images": ("observation.images.top",)}, 40,
     ),
 }  # fmt: skip
 
