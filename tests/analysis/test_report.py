@@ -266,7 +266,9 @@ HOLES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", HOLES)
+@pytest.mark.parametrize(
+    "case", ["one scenario", *(pytest.param(c, marks=pytest.mark.nightly) for c in list(HOLES)[1:])]
+)
 def test_no_file_shows_a_bare_nan(tmp_path, case):
     files = write_report(results_of(tmp_path, HOLES[case]), tmp_path / "out")
     for path in (files.html, files.markdown, files.results):

@@ -158,6 +158,7 @@ def test_caches_are_left_out_and_valid_files_pass(local):
         check_file(local, name)
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_a_dataset_with_episodes_is_published_for_lerobot_and_pulled_whole(hub, client, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

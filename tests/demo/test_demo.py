@@ -128,6 +128,7 @@ def test_command_is_the_one_a_user_would_type(settings, tmp_path):
     } < set(command)
 
 
+@pytest.mark.nightly
 def test_the_policy_rounds_as_on_other_machines(settings, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.setenv("MKL_CBWR", "AUTO")

@@ -83,6 +83,7 @@ def test_all_spellings_of_the_env_argument_agree(lerobot_eval, act):
     assert results[0] == results[1] == results[2]
 
 
+@pytest.mark.nightly
 def test_a_stock_stochastic_policy_at_batch_1_depends_on_the_trial_alone(lerobot_eval, diffusion, tmp_path):
     common = ("--eval.n_episodes=3", "--eval.batch_size=1")
     whole = read_trial_log(lerobot_eval(diffusion, *common, out="a") / "trials.jsonl")

@@ -265,6 +265,7 @@ def test_rendering_leaves_the_states_alone(simulator):
         seeing.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.render
 def test_frames_do_not_mix_between_tasks():
     """Each task has its own OpenGL context; Gymnasium alone would draw the second task in the first one's."""
