@@ -31,7 +31,11 @@ def examine(platform: str = "all") -> list[Check]:
             installed is a warning.
     """
     required = platform != "all"
-    wanted = [platform_named(platform)] if required else [p for p in all_platforms() if p.required_versions]
+    wanted = (
+        [platform_named(platform).member_of(())]
+        if required
+        else [p for p in all_platforms() if p.required_versions]
+    )
     with ThreadPoolExecutor() as pool:
         # The slow ones wait for a process or for the network, and go on side by side.
         lerobot = pool.submit(run_probe, "doctor.probe_lerobot", timeout_s=_LEROBOT_TIMEOUT_S)

@@ -192,6 +192,6 @@ def make_env(platform: str, scenario: TrialStart | None = None, **kwargs: Any) -
             f"give a scenario: gymnasium.make('roborecover/{platform.capitalize()}-v0', "
             f"scenario=load_scenarios('{platform_named(platform).default_scenarios or 'DATASET'}')[0])"
         )
-    if scenario.platform != platform:
+    if platform not in (scenario.platform, platform_named(scenario.platform).env_name):
         raise ValueError(f"scenario {scenario.id} is of platform {scenario.platform!r}, not {platform!r}")
     return RecoveryEnv(scenario, **kwargs)

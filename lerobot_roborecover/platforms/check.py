@@ -73,7 +73,7 @@ class Trace:
             return "the same states, but another answer of the success predicate"
         away = [1e3 * p.distance_m(other.bodies[n]) for n, p in self.bodies.items() if n in other.bodies]
         which = ""
-        if step is not None and self.parts and other.parts:
+        if self.parts and other.parts:
             one, two = self.parts[step], other.parts[step]
             which = f" in {', '.join(n for n in one if one[n] != two.get(n))}"
         return (

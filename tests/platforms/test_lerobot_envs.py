@@ -15,7 +15,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from lerobot_roborecover.datasets import write_scenarios
+from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.read import read_scenarios
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.platforms import make_simulator, platform_named
@@ -292,6 +293,29 @@ def test_a_base_that_cannot_be_used_is_refused(options, says):
 
     with pytest.raises(OptionError, match=says):
         env_config("lerobot", "none", options).run_spec()
+
+
+def test_the_family_stands_for_its_first_member(capsys):
+    """`roborecover_lerobot` serves several platforms; as a platform's name, it is PushT."""
+    scenario = load_scenarios("pusht_starter")[0]
+    for name in ("Lerobot", "Lerobot_pusht"):
+        env = gym.make(f"roborecover/{name}-v0", scenario=scenario, obs_type="state")
+        assert env.reset()[1]["handoff"]["identical"]
+        env.close()
+    assert main(["check-platform", "lerobot", "--steps", "5"]) == 0
+    assert "0 failures" in capsys.readouterr().out
+
+
+@pytest.mark.lerobot
+def test_a_base_is_known_by_what_a_platforms_name_has_of_it(monkeypatch):
+    from lerobot.envs.configs import EnvConfig, PushtEnv
+
+    from lerobot_roborecover.platforms.lerobot.env_config import BaseEnvConfig
+
+    monkeypatch.setitem(EnvConfig._choice_registry, "Push-T.2", PushtEnv)
+    assert BaseEnvConfig.get_choice_class("push_t_2") is PushtEnv
+    with pytest.raises(KeyError):
+        BaseEnvConfig.get_choice_class("push_t_3")
 
 
 def test_a_moving_branch_of_the_hub_is_refused():

@@ -48,8 +48,9 @@ class BaseEnvConfig(draccus.ChoiceRegistry):
 
     @classmethod
     def get_choice_class(cls, name: str) -> Any:
-        """Its class; raises `KeyError`."""
-        return cls.get_known_choices()[name]
+        """Its class; raises `KeyError`. A type is also known by what a platform's name has of it."""
+        choices = cls.get_known_choices()
+        return choices.get(name) or {member_name(n): c for n, c in choices.items()}[member_name(name)]
 
     @classmethod
     def get_choice_name(cls, subcls: type) -> str:

@@ -102,10 +102,6 @@ class LeRobotPlatform(Platform):
             return replace(source, kwargs={**source.kwargs, **kwargs})
         return replace(source, config={**source.config, **config}) if source.config else source
 
-    def picture_options(self, size: int) -> dict[str, Any]:
-        """Of PushT and Aloha; other types draw as large as they please."""
-        return super().picture_options(size) if size else {"obs_type": "state"}
-
     def owns_observation(self, observation: Mapping[str, tuple[int, ...]]) -> bool:
         """By the widths of its states."""
         known = KNOWN.get(self.env_type)

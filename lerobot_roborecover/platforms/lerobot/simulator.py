@@ -8,6 +8,7 @@ import logging
 import re
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from functools import cache
 from importlib.metadata import packages_distributions, version
 from typing import Any
 
@@ -228,7 +229,7 @@ class LeRobotSimulator:
         return hashlib.sha256(json.dumps(self.state_parts()).encode()).hexdigest()
 
     def snapshot(self) -> bytes:
-        """The physics; not exact."""
+        """The physics; whether that is all is said by `snapshot_is_exact`."""
         return pack_arrays(**self._ready().parts(), ended=np.array([self._success, self._ended]))
 
     def restore(self, snapshot: bytes) -> None:
@@ -262,7 +263,7 @@ class LeRobotSimulator:
         for kind in ("mujoco", "dm_control", "pymunk", "shapely"):
             if self._state is not None and kind in _BEHIND.get(type(self._state).__name__, ()):
                 names.add(kind)
-        by_module = packages_distributions()
+        by_module = _distributions()
         for name in sorted(names):
             for distribution in by_module.get(name, ()):
                 marks[distribution.lower().replace("_", "-")] = version(distribution)
@@ -293,6 +294,12 @@ class LeRobotSimulator:
         while len(self._envs) > _KEPT_ENVS:
             self._envs.popitem(last=False)[1].close()
         return env
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Distributions by top-level module; every one that is installed has to be looked at."""
+    return packages_distributions()
 
 
 _BEHIND = {"MujocoState": ("mujoco", "dm_control"), "PymunkState": ("pymunk", "shapely")}
