@@ -17,6 +17,12 @@ class mjtGeom(IntEnum):
     mjGEOM_BOX = ...
     mjGEOM_MESH = ...
 
+class mjtJoint(IntEnum):
+    mjJNT_FREE = ...
+    mjJNT_BALL = ...
+    mjJNT_SLIDE = ...
+    mjJNT_HINGE = ...
+
 class mjtObj(IntEnum):
     mjOBJ_CAMERA = ...
 
@@ -70,16 +76,22 @@ class MjModel:
     body_pos: np.ndarray
     body_quat: np.ndarray
     cam_pos: np.ndarray
+    geom_aabb: np.ndarray
     geom_bodyid: np.ndarray
+    geom_conaffinity: np.ndarray
     geom_contype: np.ndarray
     geom_dataid: np.ndarray
     geom_matid: np.ndarray
     geom_size: np.ndarray
     geom_type: np.ndarray
+    jnt_axis: np.ndarray
+    jnt_bodyid: np.ndarray
     jnt_dofadr: np.ndarray
     jnt_limited: np.ndarray
+    jnt_pos: np.ndarray
     jnt_qposadr: np.ndarray
     jnt_range: np.ndarray
+    jnt_type: np.ndarray
     mat_texid: np.ndarray
     mesh_face: np.ndarray
     mesh_faceadr: np.ndarray
@@ -91,6 +103,7 @@ class MjModel:
     mesh_vertnum: np.ndarray
     site_pos: np.ndarray
     site_rgba: np.ndarray
+    site_size: np.ndarray
     vis: _Visual
     @staticmethod
     def from_xml_string(xml: str) -> MjModel: ...

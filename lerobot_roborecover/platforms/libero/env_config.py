@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import LiberoEnv
+from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
@@ -20,6 +21,7 @@ from lerobot_roborecover.platforms.base import (
     refuse_unused,
 )
 from lerobot_roborecover.platforms.lerobot_features import drop_pictures
+from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 
 
 @dataclass
@@ -38,11 +40,13 @@ class LiberoConfig(LiberoEnv, FilmedEnvConfig):
         """LeRobot's choice is right here."""
 
     def __post_init__(self):
-        if self.obs_type == "state":  # robot state alone, for policies that look at nothing
+        if self.obs_type == "state":  # robot and environment state, for policies that look at nothing
             self.obs_type = "pixels_agent_pos"  # the nearest that LeRobot's own config knows
             super().__post_init__()
             self.obs_type = "state"
             drop_pictures(self)
+            self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (ENVIRONMENT_STATE_DIM,))
+            self.features_map["environment_state"] = OBS_ENV_STATE
         else:
             super().__post_init__()
 

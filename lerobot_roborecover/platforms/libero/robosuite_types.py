@@ -17,6 +17,8 @@ class _Model(Protocol):
     _model: mujoco.MjModel
 
     def body_name2id(self, name: str) -> int: ...
+    def joint_name2id(self, name: str) -> int: ...
+    def site_name2id(self, name: str) -> int: ...
 
 
 class _Data(Protocol):
@@ -79,8 +81,17 @@ class SingleArm(Protocol):
 class _Item(Protocol):
     """An object or a fixture."""
 
+    joints: Sequence[str]
     name: str
+    object_properties: Mapping[str, Any]
     root_body: str
+
+
+class _Region(Protocol):
+    """A site of an object or of a fixture, where other objects belong."""
+
+    joints: Sequence[str] | None
+    parent_name: str
 
 
 class _Sampler(Protocol):
@@ -99,7 +110,7 @@ class LiberoEnv(Protocol):
     fixtures_dict: Mapping[str, _Item]
     hard_reset: bool
     obj_body_id: Mapping[str, int]
-    object_sites_dict: Mapping[str, object]
+    object_sites_dict: Mapping[str, _Region]
     objects_dict: Mapping[str, _Item]
     parsed_problem: Mapping[str, Any]
     """The BDDL file, as LIBERO parsed it."""

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.assets import find_assets, physics_hash, quiet_import
+from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.task import FirstReset, LiberoTask
 from lerobot_roborecover.platforms.libero.view import LiberoView, ObservableClock
@@ -47,7 +48,8 @@ class LiberoSimulator:
         observation_width: pixels.
         camera_name: comma-separated, or a list.
         camera_name_mapping: LeRobot's name of each camera; None for LeRobot's own.
-        obs_type: `pixels`, `pixels_agent_pos`, or `state` (no pictures at all, and no OpenGL).
+        obs_type: `pixels`, `pixels_agent_pos`, or `state`: no pictures at all and no OpenGL, but
+            `environment_state` (77,) float64, what `goal_state.ENVIRONMENT_STATE` says.
         control_mode: what the policy's actions are: `relative` or `absolute`.
         fps: control steps per simulated second.
         render_quality: `full` is LeRobot's, bit for bit; `fast` leaves out shadows, reflections,
@@ -174,6 +176,8 @@ class LiberoSimulator:
             }
         if self._obs_type != "pixels":
             observation["robot_state"] = self._view.robot_state()
+        if self._obs_type == "state":
+            observation["environment_state"] = self._view.environment_state()
         return observation
 
     def render(self) -> np.ndarray:
@@ -289,7 +293,7 @@ def _require(option: str, value: str, allowed: tuple[str, ...]) -> None:
 
 
 def _observation_space(obs_type: str, images: list[str], size: tuple[int, int]) -> gym.spaces.Dict:
-    """LeRobot's observation space of LIBERO (lerobot/envs/libero.py), plus the one without pictures."""
+    """LeRobot's observation space of LIBERO (lerobot/envs/libero.py), plus what stands for pictures."""
 
     def real(*shape: int) -> gym.spaces.Box:
         return gym.spaces.Box(-np.inf, np.inf, shape, np.float64)
@@ -305,4 +309,6 @@ def _observation_space(obs_type: str, images: list[str], size: tuple[int, int]) 
                 "joints": gym.spaces.Dict({"pos": real(7), "vel": real(7)}),
             }
         )
+    if obs_type == "state":
+        spaces["environment_state"] = real(ENVIRONMENT_STATE_DIM)
     return gym.spaces.Dict(spaces)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.fast import light_copy, without_reflections
+from lerobot_roborecover.platforms.libero.goal_state import GoalState
 from lerobot_roborecover.platforms.libero.task import LiberoTask
 from lerobot_roborecover.platforms.simulator import Observation, SimulatorError
 
@@ -89,6 +90,7 @@ class LiberoView:
         self._task, self._height, self._width, self._fast = task, height, width, fast
         self._renderer: mujoco.Renderer | None = None
         self._model: mujoco.MjModel | None = None
+        self._goal_state: GoalState | None = None
         self._frames: dict[str, np.ndarray] = {}
 
     def sample(self) -> None:
@@ -96,7 +98,7 @@ class LiberoView:
         task = self._task
         if self._model is not task.model:  # a hard reset compiled a new one
             self.close()
-            self._model = task.model
+            self._model, self._goal_state = task.model, None
             self._scratch = mujoco.MjData(task.model)
         for name in _SEEN:
             getattr(self._scratch, name)[:] = getattr(task.data, name)
@@ -122,6 +124,12 @@ class LiberoView:
                 "vel": data.qvel[robot._ref_joint_vel_indexes],
             },
         }
+
+    def environment_state(self) -> np.ndarray:
+        """See `goal_state.ENVIRONMENT_STATE`; (77,) float64."""
+        if self._goal_state is None:
+            self._goal_state = GoalState(self._task)
+        return self._goal_state.read(self._scratch)
 
     def frame(self, camera: str) -> np.ndarray:
         """(H, W, 3) uint8 in robosuite's raw orientation (bottom row first); the caller must not write to it.
