@@ -1,0 +1,241 @@
+"""Demonstrations of LIBERO's tasks by the scripted expert as a LeRobotDataset, for `lerobot-train`.
+
+Objects stand where LIBERO's own placement draws them, as in LIBERO's demonstrations: none of the stored
+init states, from which policies are evaluated and scenarios are made, is among them. Every second episode is
+clean; in the others the arm is shaken for a while, while the recorded action stays the expert's, so that a
+policy trained on them has seen states beside the expert's path.
+
+    python -m recipes.libero.demonstrations --out DIR --episodes-per-task 40 --workers 2
+
+Each task's episodes are kept in `DIR.parts` once they are whole; a second call goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.platforms.libero.expert import LiberoExpert
+from lerobot_roborecover.platforms.libero.platform import PLATFORM
+from lerobot_roborecover.platforms.libero.scene import LiberoScene
+from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.platforms.starts import RELEASE_SEED
+from lerobot_roborecover.scenario import Reset, Task
+from lerobot_roborecover.whole import new_folder
+
+FIRST_SEED = 20_000
+"""Seeds of demonstrations start here."""
+_STEPS_AFTER_SUCCESS = 3
+_GIVE_UP_AFTER = 3
+"""Rollouts for each episode that is wanted."""
+CAMERAS = ("image", "image2")
+"""LeRobot's names of the scene's and the wrist's camera."""
+_WIDTHS = {"observation.state": 8, "observation.environment_state": 77, "action": 7, "next.reward": 1}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a worker makes of one task."""
+
+    task: Task
+    episodes: int
+    pictures: int
+    """Side, pixels; 0 for none."""
+    part: Path
+
+
+def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> None:
+    """Puts a task where LIBERO's own placement, not a stored init state, has its objects.
+
+    Raises:
+        SimulatorError: LIBERO found no placement.
+    """
+    simulator.reset(task, PLATFORM.first_reset(task))
+    built = simulator._task
+    drawn = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        built._reset_env()
+        state, fixtures = built.env.sim.get_state().flatten(), built.fixtures()
+    finally:
+        np.random.set_state(drawn)
+    kept, built.init_states = built.init_states, state[None]
+    try:
+        simulator.reset(task, Reset(RELEASE_SEED, 0, PLATFORM.settle_steps, fixtures=fixtures))
+    finally:
+        built.init_states = kept
+    for _ in range(PLATFORM.settle_steps):
+        simulator.step(PLATFORM.no_op())
+
+
+def demonstration(
+    simulator: LiberoSimulator, task: Task, seed: int, shaken: bool
+) -> dict[str, np.ndarray] | None:
+    """One successful episode of T steps, as arrays by LeRobot's names; None where the expert failed.
+
+    Args:
+        simulator: with `obs_type="state"` or with pictures.
+        task: what to demonstrate.
+        seed: of the placement and of the shaking.
+        shaken: disturb the executed actions for 20 to 100 steps from a step that is drawn.
+    """
+    rng = np.random.default_rng(seed)
+    place_freshly(simulator, task, seed)
+    first = int(rng.integers(0, 60))
+    last = first + int(rng.integers(20, 100)) if shaken else first
+    expert, seen, actions, solved = LiberoExpert(LiberoScene(simulator)), [], [], []
+    for t in range(task.horizon):
+        seen.append(simulator.observe() | {"environment_state": simulator._view.environment_state()})
+        actions.append(expert.act())
+        simulator.step(perturb_translations(actions[-1], rng) if first <= t < last else actions[-1])
+        solved.append(simulator.succeeded())
+        if sum(solved) == _STEPS_AFTER_SUCCESS:
+            return _columns(seen, np.array(actions), np.array(solved))
+    return None
+
+
+def _columns(seen: Sequence[Any], actions: np.ndarray, solved: np.ndarray) -> dict[str, np.ndarray]:
+    """What a policy's environment processors make of the observations."""
+    from lerobot.envs.utils import preprocess_observation
+
+    stacked = _stacked(seen)
+    observation = PLATFORM.process_observation(preprocess_observation(stacked))
+    columns = {
+        name: observation[name].numpy() for name in ("observation.state", "observation.environment_state")
+    }
+    for camera in CAMERAS:
+        if (pictures := observation.get(f"observation.images.{camera}")) is not None:
+            pictures = (pictures * 255).round().byte().permute(0, 2, 3, 1)
+            columns[f"observation.images.{camera}"] = pictures.numpy()
+    columns["action"] = np.clip(actions, -1, 1).astype(np.float32)
+    columns["next.reward"] = solved[:, None].astype(np.float32)
+    return columns
+
+
+def _stacked(values: Sequence[Any]) -> Any:
+    if isinstance(values[0], Mapping):
+        return {key: _stacked([value[key] for value in values]) for key in values[0]}
+    return np.stack(values)
+
+
+def make_part(wanted: Wanted) -> str:
+    """One task's episodes, in one file; says how it went."""
+    began = time.monotonic()
+    options: dict[str, Any] = {"obs_type": "state"}
+    if wanted.pictures:
+        options = {
+            "obs_type": "pixels_agent_pos",
+            "render_quality": "fast",
+            "observation_height": wanted.pictures,
+            "observation_width": wanted.pictures,
+        }
+    simulator = LiberoSimulator(**options)
+    episodes, tried = [], 0
+    while len(episodes) < wanted.episodes and tried < _GIVE_UP_AFTER * wanted.episodes:
+        try:
+            episode = demonstration(simulator, wanted.task, FIRST_SEED + tried, len(episodes) % 2 == 1)
+        except SimulatorError:
+            episode = None
+        tried += 1
+        if episode is not None:
+            episodes.append(episode)
+    simulator.close()
+    wanted.part.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = wanted.part.with_suffix(".unfinished.npz")
+    names = episodes[0] if episodes else ()
+    np.savez(
+        unfinished,
+        lengths=np.array([len(e["action"]) for e in episodes], dtype=np.int64),
+        tried=np.array(tried),
+        **{name: np.concatenate([e[name] for e in episodes]) for name in names},
+    )
+    unfinished.rename(wanted.part)
+    took = time.monotonic() - began
+    return f"{PLATFORM.short_name(wanted.task)}: {len(episodes)} episodes from {tried} rollouts, {took:.0f} s"
+
+
+def write_dataset(root: Path, parts: Sequence[tuple[Task, Path]]) -> int:
+    """Writes the parts as one LeRobotDataset, whole or not at all; returns its episodes.
+
+    Its features are those of `--env.obs_type=state`, float32, and `next.reward`, 1 once the task is solved;
+    with pictures, `observation.images.image` and `observation.images.image2`, too.
+    """
+    from lerobot.datasets import dataset_writer
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    with np.load(parts[0][1]) as first:
+        sides = {n: first[n].shape[1:] for n in first.files if n.startswith("observation.images.")}
+    if not sides:  # LeRobot looks for pictures to embed row by row, which takes most of the time
+        dataset_writer.embed_images = lambda rows: rows
+    features: dict[str, dict[str, Any]] = {
+        name: {"dtype": "float32", "shape": (width,), "names": None} for name, width in _WIDTHS.items()
+    }
+    for name, shape in sides.items():
+        features[name] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    with new_folder(root) as folder:
+        dataset = LeRobotDataset.create(
+            repo_id="roborecover/libero_demonstrations",
+            root=folder,
+            fps=int(PLATFORM.control_hz),
+            robot_type="panda",
+            features=features,
+            use_videos=False,
+        )
+        episodes = 0
+        for task, path in parts:
+            with np.load(path) as part:
+                columns = {name: part[name] for name in features if name in part.files}
+                ends = np.cumsum(part["lengths"])
+            for begin, end in zip([0, *ends[:-1]], ends, strict=False):
+                for row in range(begin, end):
+                    frame = {name: column[row] for name, column in columns.items()}
+                    dataset.add_frame(frame | {"task": task.instruction})
+                dataset.save_episode()
+                episodes += 1
+        dataset.finalize()
+    return episodes
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder to write; must not exist")
+    parser.add_argument("--episodes-per-task", type=int, default=40)
+    parser.add_argument("--suites", nargs="+", help="of these alone")
+    parser.add_argument("--pictures", type=int, default=0, help="side of the two pictures; 0: none")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    args = parser.parse_args()
+    if args.out.exists():
+        parser.error(f"--out={args.out} exists already")
+    tasks = [t for t in PLATFORM.tasks() if not args.suites or t.suite in args.suites]
+    if not tasks:
+        parser.error(f"--suites {args.suites}: there are {sorted({t.suite for t in PLATFORM.tasks()})}")
+    folder = args.out.with_name(f"{args.out.name}.parts")
+    wanted = [
+        Wanted(t, args.episodes_per_task, args.pictures, folder / f"{PLATFORM.short_name(t)}.npz")
+        for t in tasks
+    ]
+    missing = [w for w in wanted if not w.part.exists()]
+    with ProcessPoolExecutor(
+        args.workers, multiprocessing.get_context("spawn"), max_tasks_per_child=1
+    ) as pool:
+        for done in as_completed([pool.submit(make_part, w) for w in missing]):
+            print(done.result(), flush=True)
+    parts = [(w.task, w.part) for w in wanted if len(np.load(w.part)["lengths"])]
+    print(f"{write_dataset(args.out, parts)} episodes in {args.out}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
