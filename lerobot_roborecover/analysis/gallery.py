@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.logs import Study
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario
@@ -37,15 +36,22 @@ class PolicyMarks:
     """The same for readers without the signs."""
     initial: str = ""
     """Signs of the trials from the initial state; empty where there are none."""
+    rate: float | None = None
+    """Share of its trials that solved it, in [0, 1]; None where it was not run."""
 
 
 @dataclass(frozen=True)
 class TrialVideo:
-    """A video of one trial."""
+    """A video of one trial, or a recording for the rerun viewer."""
 
     policy: str
     uri: str
-    """Data URI."""
+    """Data URI, or the file's path from the page."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether the rerun viewer shows it, and not the browser."""
+        return self.uri.endswith(".rrd")
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class Card:
     source: str
     source_policy: str
     frame: str
-    """Data URI of the recovery frame; empty where there is none."""
+    """Data URI of the recovery frame, or its file's path from the page; empty where there is none."""
     marks: tuple[PolicyMarks, ...]
     clips: tuple[TrialVideo, ...]
     outcome_classes: tuple[str, ...]
@@ -72,7 +78,7 @@ class Card:
 
 def make_cards(
     panel: Panel,
-    frames: Mapping[str, bytes],
+    frames: Mapping[str, bytes | str],
     clips: Mapping[str, Sequence[TrialVideo]],
     initial: Panel | None = None,
 ) -> list[Card]:
@@ -80,7 +86,7 @@ def make_cards(
 
     Args:
         panel: trials from recovery points.
-        frames: PNG or JPEG files by scenario id.
+        frames: PNG or JPEG files by scenario id: their content, or their path from the page.
         clips: videos by scenario id.
         initial: trials of the same policies from initial states.
     """
@@ -98,7 +104,7 @@ def make_cards(
                 cell=scenario.cell.replace("-", ", ", 1),
                 source=scenario.source,
                 source_policy=scenario.source_policy,
-                frame=_image_uri(frames[scenario.id]) if scenario.id in frames else "",
+                frame=_image_uri(frames.get(scenario.id, "")),
                 marks=tuple(
                     _marks(
                         panel.arms[p],
@@ -153,19 +159,41 @@ def _marks(policy: str, rows: Sequence[TrialRow], scheduled: int, initial: Seque
             why = f", {row.reason}" if row.reason else ""
             words += f"; trial {row.trial}: {row.outcome.replace('_', ' ')}{why}"
     shown = "".join(SIGNS[kind] for kind in kinds) + "–" * missing
-    return PolicyMarks(policy, shown, words + from_start, signs)
+    return PolicyMarks(policy, shown, words + from_start, signs, kinds.count("success") / scheduled)
 
 
-def _image_uri(data: bytes) -> str:
+def _image_uri(data: bytes | str) -> str:
+    if isinstance(data, str):
+        return data
     kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def check_scenarios(study: Study, scenarios: Sequence[Scenario], name: str) -> list[str]:
-    """Compares a study with the scenario set it is said to be on.
+def gallery_values(cards: Sequence[Card]) -> dict[str, Any]:
+    """What the gallery's template asks for.
 
     Args:
-        study: the trials.
+        cards: of `make_cards`.
+    """
+    present = {kind for card in cards for kind in card.outcome_classes}
+    policies = list(dict.fromkeys(mark.policy for card in cards for mark in card.marks))
+    return {
+        "cards": cards,
+        "both_starts": any(mark.initial for card in cards for mark in card.marks),
+        "choices": {
+            key: sorted({getattr(card, key) for card in cards}) for key in ("cell", "source", "suite")
+        },
+        "outcome_classes": {k: v for k, v in OUTCOME_CLASSES.items() if k in present},
+        "signs": SIGNS,
+        "policies": policies,
+    }
+
+
+def check_scenarios(trials: Iterable[TrialRow], scenarios: Sequence[Scenario], name: str) -> list[str]:
+    """Compares trials with the scenario set they are said to be on.
+
+    Args:
+        trials: from the logs.
         scenarios: the set.
         name: what to call it.
 
@@ -176,7 +204,7 @@ def check_scenarios(study: Study, scenarios: Sequence[Scenario], name: str) -> l
         RowsError: a row's scenario is not in the set, or is another one of the same name.
     """
     known = {s.id: s.sha256() for s in scenarios}
-    rows = {row.scenario_id: row for arm in study.arms for row in arm.rows}
+    rows = {row.scenario_id: row for row in trials}
     unknown = sorted(set(rows) - set(known))
     if unknown:
         raise RowsError(
@@ -193,42 +221,3 @@ def check_scenarios(study: Study, scenarios: Sequence[Scenario], name: str) -> l
         )
     idle = sorted(set(known) - set(rows))
     return [f"{len(idle)} of {len(known)} scenarios of {name} have no trial, e.g. {idle[0]}"] if idle else []
-
-
-def find_clips(
-    folders: Sequence[tuple[str, Path]], ids: Sequence[str], limit_bytes: int
-) -> tuple[dict[str, list[TrialVideo]], list[str]]:
-    """Videos as `lerobot-eval` names them: `<group>_<scenario id>/eval_episode_0.mp4`, the first of each.
-
-    Args:
-        folders: name of the policy and where its videos are, at any depth.
-        ids: scenarios to look for.
-        limit_bytes: total size to take in; the rest is left out, and said.
-
-    Returns:
-        Clips by scenario id, and remarks.
-
-    Raises:
-        RowsError: a folder does not exist.
-    """
-    clips: dict[str, list[TrialVideo]] = {}
-    used = skipped = 0
-    for name, folder in folders:
-        if not folder.is_dir():
-            raise RowsError(f"no folder of videos at {folder}")
-        by_folder = {path.parent.name: path for path in sorted(folder.rglob("eval_episode_0.mp4"))}
-        for scenario_id in ids:
-            names = [name for name in by_folder if name == scenario_id or name.endswith(f"_{scenario_id}")]
-            found = [by_folder[name] for name in names]
-            if not found:
-                continue
-            size = found[0].stat().st_size
-            if used + size > limit_bytes:
-                skipped += 1
-                continue
-            used += size
-            data = base64.b64encode(found[0].read_bytes()).decode()
-            clips.setdefault(scenario_id, []).append(TrialVideo(name, f"data:video/mp4;base64,{data}"))
-    if skipped:
-        return clips, [f"{skipped} video(s) are left out: all together exceed {limit_bytes // 2**20} MiB"]
-    return clips, []

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
+from pathlib import Path
 
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard
-
-_HUB_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}")
+from lerobot_roborecover.datasets.benchmark import TASKS
+from lerobot_roborecover.datasets.load import HUB_ID
+from lerobot_roborecover.scenario import ScenarioError
 
 
 def find_entry(found: Leaderboard, policy: str | None) -> tuple[Board, Entry]:
@@ -30,44 +33,51 @@ def find_entry(found: Leaderboard, policy: str | None) -> tuple[Board, Entry]:
     if len(entries) != 1:
         names = ", ".join(sorted({e.policy for b in found.boards for e in b.entries})) or "none"
         raise RowsError(
-            f"{len(entries)} entries fit --policy={policy}; exactly one result can be pushed at a "
-            f"time. There are: {names}"
+            f"{len(entries)} entries fit --policy={policy}; exactly one result can be offered at "
+            f"a time. There are: {names}"
         )
     return entries[0]
 
 
-def results_yaml(board: Board, entry: Entry, dataset_id: str | None = None) -> str:
+def results_yaml(board: Board, entry: Entry, dataset_id: str | None = None, source: str | None = None) -> str:
     """The file's text: RSR, Macro and, where there is one, the initial-state rate, in per cent.
 
     Args:
         board: where the entry stands.
         entry: the result.
         dataset_id: the scenario set's id on the Hub; by default the one in the logs.
+        source: address of the published trial log.
 
     Raises:
         RowsError: the scenario set has no id on the Hub, or the entry is no complete result of the policy
-        alone.
+        alone, or the source is no address.
     """
     import yaml
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
     dataset = dataset_id or entry.provenance.dataset
-    if not _HUB_ID.fullmatch(dataset):
+    if not HUB_ID.fullmatch(dataset):
         raise RowsError(
             f"the scenario set {dataset!r} is not a data set on the Hub, which the metadata must "
             "name. Publish it "
             "(roborecover publish) and evaluate from there, or say --dataset-id ORG/NAME"
         )
-    if entry.scenarios < board.scenarios or entry.interventions:
-        what = (
-            "is an intervention"
-            if entry.interventions
-            else f"covers {entry.scenarios} of {board.scenarios} scenarios"
+    if source is not None and not re.fullmatch(r"https?://\S+", source):
+        raise RowsError(
+            f"--source {source!r:.200}: write the address of the published trial log, https://..."
         )
-        raise RowsError(f"{entry.policy} {what}: only complete results of a policy alone are pushed")
-    metrics = {"recovery_success_rate": entry.rsr, "macro_recovery_success_rate": entry.macro}
-    if not math.isnan(entry.initial.value):
-        metrics["initial_state_success_rate"] = entry.initial
+    problem = (
+        "is an intervention"
+        if entry.interventions
+        else "was stopped when a sequential comparison was decided"
+        if entry.stopped
+        else f"covers {entry.scenarios} of {board.scenarios} scenarios"
+        if entry.scenarios < board.scenarios
+        else ""
+    )
+    if problem:
+        raise RowsError(f"{entry.policy} {problem}: only complete results of a policy alone are offered")
+    metrics = {task: rate for task, rate in rates_of(entry).items() if not math.isnan(rate.value)}
     entries = [
         EvalResultEntry(
             dataset_id=dataset,
@@ -78,11 +88,18 @@ def results_yaml(board: Board, entry: Entry, dataset_id: str | None = None) -> s
             if dataset == entry.provenance.dataset
             else None,
             date=entry.provenance.finished_at,
+            source_url=source,
+            source_name="RoboRecover trial log" if source else None,
             notes=_notes(entry, estimate, board),
         )
         for task, estimate in metrics.items()
     ]
     return yaml.safe_dump(eval_result_entries_to_yaml(entries), sort_keys=False, allow_unicode=True)
+
+
+def rates_of(entry: Entry) -> dict[str, Estimate]:
+    """An entry's rates in [0, 1] by the benchmark's ids of results; NaN where it has none."""
+    return dict(zip(TASKS, (entry.rsr, entry.macro, entry.initial), strict=True))
 
 
 def _notes(entry: Entry, estimate: Estimate, board: Board) -> str:
@@ -105,32 +122,65 @@ def file_name(board: Board) -> str:
     return f".eval_results/roborecover-{name}.yaml"
 
 
-def push_results(repo_id: str, path: str, text: str) -> str:
-    """Commits the file to a model's repository.
+def log_files(folder: Path, entry: Entry) -> dict[str, Path]:
+    """The trial logs of an entry, by their path in the model's repository.
+
+    Args:
+        folder: where the logs of the leaderboard are.
+        entry: the result.
+
+    Raises:
+        RowsError: it was made from several logs: there is one source of a result.
+    """
+    if len(entry.provenance.logs) > 1:
+        raise RowsError(
+            f"{entry.policy} was made from {len(entry.provenance.logs)} logs, and a result has one source. "
+            "Merge them first (roborecover merge)"
+        )
+    ((name, digest),) = (log.rsplit(" ", 1) for log in entry.provenance.logs)
+    return {f"roborecover/trials-{digest}.jsonl": folder / name}
+
+
+def file_address(repo_id: str, path: str) -> str:
+    """Where a file of a model's repository is shown once it is merged."""
+    from huggingface_hub import HfApi
+
+    return f"{HfApi().endpoint}/{repo_id}/blob/main/{path}"
+
+
+def offer_results(repo_id: str, files: Mapping[str, bytes | Path]) -> str:
+    """Opens a pull request at a model's repository, which its owners merge or not.
 
     Args:
         repo_id: the model on the Hub.
-        path: in the repository.
-        text: the file.
+        files: by path in the repository.
 
     Returns:
-        Address of the commit.
+        Address of the pull request.
 
     Raises:
         ScenarioError: the Hub refuses, or does not answer.
     """
-    from huggingface_hub import HfApi
+    from huggingface_hub import CommitOperationAdd, HfApi
 
     from lerobot_roborecover.datasets.retries import again
 
+    where = f"Hub model {repo_id}"
+    operations = [
+        CommitOperationAdd(path, str(content) if isinstance(content, Path) else content)
+        for path, content in files.items()
+    ]
     commit = again(
-        lambda: HfApi().upload_file(
-            path_or_fileobj=text.encode(),
-            path_in_repo=path,
-            repo_id=repo_id,
-            repo_type="model",
+        lambda: HfApi().create_commit(
+            repo_id,
+            operations,
             commit_message="RoboRecover evaluation results",
+            commit_description="Success from recovery points, measured with RoboRecover; the notes of each "
+            "result say on how many scenarios and trials, and with which versions.",
+            create_pr=True,
         ),
-        f"Hub model {repo_id}: pushing {path}",
+        f"{where}: offering {', '.join(files)}",
     )
-    return commit.commit_url
+    if not commit.pr_url:
+        raise ScenarioError(f"{where}: the Hub opened no pull request; look at its community page")
+    return commit.pr_url

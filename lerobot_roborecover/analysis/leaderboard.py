@@ -23,7 +23,7 @@ from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.logs import Arm, arm_of, clock_of, stopped
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.panel import make_panel
+from lerobot_roborecover.analysis.panel import Panel, make_panel
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.runs import method_rate, run_rates
@@ -104,12 +104,23 @@ class Board:
 
 
 @dataclass(frozen=True)
+class BoardTrials:
+    """What a board's numbers were made from."""
+
+    recovery: Panel
+    initial: Panel | None
+    """Trials of the same policies from initial states; None where there are none."""
+
+
+@dataclass(frozen=True)
 class Leaderboard:
     """All boards of a folder, and what could not be used."""
 
     boards: tuple[Board, ...]
     refused: tuple[tuple[str, str], ...]
     """File name and reason."""
+    trials: tuple[BoardTrials, ...] = ()
+    """Of each board."""
 
 
 def make_leaderboard(
@@ -167,7 +178,7 @@ def make_leaderboard(
     for (board, entry), reason in contradicted.items():
         refused.append((entry[0], f"{reason}; neither is used for this policy. Take the wrong one away"))
         del groups[board][entry]
-    boards = []
+    boards: list[tuple[Board, BoardTrials]] = []
     for key, entries in groups.items():
         rows_of = {e: [row for row, _ in found.values()] for e, found in entries.items()}
         usable = {e: rows for e, rows in rows_of.items() if any(r.start == Start.RECOVERY for r in rows)}
@@ -180,10 +191,17 @@ def make_leaderboard(
                 )
             except RowsError as err:
                 refused.append((f"{key[0]}, {key[1]}", str(err)))
-    boards.sort(
-        key=lambda b: (b.platform, b.dataset, sorted(b.simulators.items()), -len(b.entries), b.scenario_set)
+    boards.sort(key=lambda found: _order(found[0]))
+    return Leaderboard(
+        tuple(board for board, _ in boards),
+        tuple(dict.fromkeys(refused)),
+        tuple(trials for _, trials in boards),
     )
-    return Leaderboard(tuple(boards), tuple(dict.fromkeys(refused)))
+
+
+def _order(board: Board) -> tuple:
+    simulators = sorted(board.simulators.items())
+    return board.platform, board.dataset, simulators, -len(board.entries), board.scenario_set
 
 
 def _board_key(row: TrialRow) -> tuple:
@@ -249,7 +267,7 @@ def _board(
     options: Options,
     run_of: dict[int, str],
     records: Sequence[SequentialRecord],
-) -> Board:
+) -> tuple[Board, BoardTrials]:
     platform, dataset, split, simulators, kind = key
     arms = list(stopped([_arm(e, rows, Start.RECOVERY, run_of) for e, rows in usable.items()], records))
     panel = make_panel(arms, options.scheduled)
@@ -299,9 +317,15 @@ def _board(
     entries.sort(key=lambda e: (e.interventions, e.scenarios < len(panel.scenarios), -e.rsr.value, e.policy))
     name = f"{dataset}, {split}{kind}"
     digest = hashlib.sha256("\n".join(f"{i} {h}" for i, h in sorted(scenario_set)).encode()).hexdigest()[:12]
-    return Board(
+    board = Board(
         platform, name, digest, len(panel.scenarios), dict(simulators), tuple(entries), options, WORDS[unit]
     )
+    before = [
+        _arm(e, rows, Start.INITIAL, run_of)
+        for e, rows in usable.items()
+        if any(r.start == Start.INITIAL for r in rows)
+    ]
+    return board, BoardTrials(panel, make_panel(before) if before else None)
 
 
 def _of_the_best(contrast: Contrast, best_is_a: bool) -> ComparisonVerdict:

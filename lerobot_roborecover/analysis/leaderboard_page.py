@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_roborecover.analysis import published
@@ -14,7 +15,7 @@ from lerobot_roborecover.whole import write_whole
 
 
 def write_leaderboard(
-    found: Leaderboard, out: Path, title: str = "Recovery leaderboard"
+    found: Leaderboard, out: Path, title: str = "Recovery leaderboard", galleries: Sequence[str] = ()
 ) -> tuple[Path, Path]:
     """Writes `index.html` and `leaderboard.json`.
 
@@ -22,9 +23,15 @@ def write_leaderboard(
         found: what to show.
         out: folder; made if need be.
         title: heading of the page.
+        galleries: pages of the boards' scenarios, beside this one, where there are some.
     """
     boards = [
-        {"board": board, "table": board_table(board, n), "published": published_table(board.platform)}
+        {
+            "board": board,
+            "table": board_table(board, n),
+            "published": published_table(board.platform),
+            "gallery": galleries[n] if galleries else "",
+        }
         for n, board in enumerate(found.boards)
     ]
     page = render_page("leaderboard.html.j2", title=title, boards=boards, refused=found.refused)

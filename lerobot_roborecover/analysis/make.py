@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.analysis.gallery import check_scenarios, find_clips
+from lerobot_roborecover.analysis.gallery import check_scenarios
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.logs import Study, read_study
+from lerobot_roborecover.analysis.media import find_clips
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.report import Extras, ReportFiles, write_report
@@ -126,7 +127,9 @@ def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[
         from lerobot_roborecover.datasets import load_scenarios
 
         chosen = load_scenarios(gallery.scenarios, revision=gallery.revision)
-        remarks += check_scenarios(study, tuple(chosen), gallery.scenarios)
+        remarks += check_scenarios(
+            (row for arm in study.arms for row in arm.rows), tuple(chosen), gallery.scenarios
+        )
         wanted = [s for s in chosen if s.id in set(ids)]
         frames = {
             s.id: s.fingerprint.frames_png[-1] for s in wanted if s.fingerprint and s.fingerprint.frames_png

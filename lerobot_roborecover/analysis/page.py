@@ -25,13 +25,16 @@ PHONE_PX = 640
 """Width of a window up to which the narrow drawings are shown."""
 
 
-def render_page(template: str, *, title: str, scripts: Sequence[str] = (), **values: Any) -> str:
+def render_page(
+    template: str, *, title: str, scripts: Sequence[str] = (), with_files: bool = False, **values: Any
+) -> str:
     """One page.
 
     Args:
         template: file name in this folder; extends `base.html.j2`.
         title: of the page.
         scripts: file names of scripts beside the one that all pages have.
+        with_files: pictures and videos may lie beside the page, and not only in it.
         values: what the template asks for.
     """
     texts = [_file(name) for name in ("page.js", *scripts)]
@@ -44,6 +47,7 @@ def render_page(template: str, *, title: str, scripts: Sequence[str] = (), **val
             scripts=texts,
             # Only these scripts run: a name from a log that slipped through could not.
             allowed=" ".join(f"'sha256-{_digest(text)}'" for text in texts),
+            files="data: 'self'" if with_files else "data:",
             phone_px=PHONE_PX,
             version=__version__,
             **values,

@@ -13,7 +13,7 @@ from typing import Any
 from lerobot_roborecover import __version__
 from lerobot_roborecover.analysis.escape import markdown, markdown_alt
 from lerobot_roborecover.analysis.figures import all_figures
-from lerobot_roborecover.analysis.gallery import OUTCOME_CLASSES, SIGNS, Card, TrialVideo, make_cards
+from lerobot_roborecover.analysis.gallery import Card, TrialVideo, gallery_values, make_cards
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.page import grouped, picture, render_page
@@ -222,12 +222,6 @@ def _html(
         for anchor, figure, names in _SECTIONS
         if figure in images or any(name in by_name for name in names)
     ]
-    choices = {
-        "cell": sorted({card.cell for card in cards}),
-        "source": sorted({card.source for card in cards}),
-        "suite": sorted({card.suite for card in cards}),
-    }
-    present = {kind for card in cards for kind in card.outcome_classes}
     heads = {arm.title for arm in results.study.arms} | {str(path) for path in results.study.logs}
     return render_page(
         "report.html.j2",
@@ -237,12 +231,7 @@ def _html(
         introduction=extras.introduction,
         remarks=grouped(remarks, [*heads, *results.study.policies]),
         sections=sections,
-        cards=cards,
-        both_starts=any(mark.initial for card in cards for mark in card.marks),
-        choices=choices,
-        outcome_classes={k: v for k, v in OUTCOME_CLASSES.items() if k in present},
-        signs=SIGNS,
+        **gallery_values(cards),
         commands=extras.commands,
         provenance=json.dumps(provenance, indent=1),
-        several=len(results.recovery.arms) > 1,
     )

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_roborecover.cli.report import add_draws_arguments, analysis_options
 
+if TYPE_CHECKING:
+    from lerobot_roborecover.analysis.leaderboard import Leaderboard
+
 HELP = (
-    "Make a leaderboard (a static page and JSON) from all trial logs below a folder; or push one "
-    "policy's results "
-    "to its model repository on the Hub."
+    "Make a leaderboard (a static page, JSON, a Space for the Hub) from all trial logs below a folder; offer "
+    "one policy's results to its model on the Hub; compare with the Hub's board."
 )
 
 
@@ -28,19 +32,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=LOG,LOG",
         help="logs below the folder (or folders of them) that are the runs of one method; may be given again",
     )
+    space = parser.add_argument_group("a Space")
+    add = space.add_argument
+    add("--space", type=Path, metavar="DIR", help="also write a static Space: boards, scenarios, videos")
+    add("--render", action="store_true", help="render recovery frames that the scenario sets do not hold")
     add(
-        "--push-to",
+        "--videos", action="append", default=[], metavar="NAME=DIR",
+        help="a policy's videos or .rrd recordings for the Space; may be given again",
+    )  # fmt: skip
+    hub = parser.add_argument_group("results on the Hub")
+    add = hub.add_argument
+    add(
+        "--hub",
         metavar="ORG/MODEL",
-        help="push results to this model on the Hub as evaluation-results metadata",
+        help="offer one policy's results to this model's repository as a pull request (.eval_results/*.yaml)",
     )
-    add("--policy", help="whose results to push, where there are several")
+    add("--policy", help="whose results to offer, where there are several")
     add("--dataset-id", metavar="ORG/NAME", help="the scenario set on the Hub, where the logs name a folder")
-    add("--dry-run", action="store_true", help="show what would be pushed, and push nothing")
+    add("--source", metavar="URL", help="where the trial log is published")
+    add("--with-log", action="store_true", help="put the trial log into the pull request, as the source")
+    add("--dry-run", action="store_true", help="show what would be offered, and offer nothing")
+    add(
+        "--hub-board",
+        metavar="ORG/SET",
+        help="read this scenario set's results on the Hub, and compare them with the local ones",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes the page; pushes where asked. 1 when some log could not be used."""
-    from lerobot_roborecover.analysis.hub_results import file_name, find_entry, push_results, results_yaml
+    """Writes the page; offers and compares where asked. 1 when some log could not be used."""
     from lerobot_roborecover.analysis.leaderboard import make_leaderboard
     from lerobot_roborecover.analysis.leaderboard_page import board_table, write_leaderboard
     from lerobot_roborecover.analysis.tables import to_text
@@ -53,12 +73,45 @@ def run(args: argparse.Namespace) -> int:
     for name, reason in found.refused:
         print(f"not used: {name}: {reason}")
     print(f"page      {page}\ndata      {data}")
-    if args.push_to:
-        board, entry = find_entry(found, args.policy)
-        text, path = results_yaml(board, entry, args.dataset_id), file_name(board)
-        print(f"\n{path} in {args.push_to}:\n{text}")
-        if args.dry_run:
-            print("dry run: nothing was pushed")
-        else:
-            print(f"commit    {push_results(args.push_to, path, text)}")
+    if args.space:
+        _write_space(args, found)
+    if args.hub:
+        _offer(args, found)
+    if args.hub_board:
+        from lerobot_roborecover.analysis.hub_board import comparison_table, read_board
+
+        table = comparison_table(args.hub_board, read_board(args.hub_board), found)
+        print(f"\n{table.title}\n{to_text(table)}")
     return int(bool(found.refused))
+
+
+def _write_space(args: argparse.Namespace, found: Leaderboard) -> None:
+    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.analysis.space import SpaceConfig, write_space
+
+    media = [(name, Path(folder)) for name, folder in map(split_named, args.videos)]
+    for remark in write_space(found, args.space, SpaceConfig(args.title, args.render, media)):
+        print(f"note: {remark}", file=sys.stderr)
+    print(f"space     {args.space}: hf upload ORG/NAME {args.space} --repo-type space")
+
+
+def _offer(args: argparse.Namespace, found: Leaderboard) -> None:
+    from lerobot_roborecover.analysis import hub_results
+    from lerobot_roborecover.errors import OptionError
+
+    if args.source and args.with_log:
+        raise OptionError("--source and --with-log: a result has one source. Leave one of them out")
+    board, entry = hub_results.find_entry(found, args.policy)
+    logs = hub_results.log_files(args.folder, entry) if args.with_log else {}
+    source = next((hub_results.file_address(args.hub, path) for path in logs), args.source)
+    path = hub_results.file_name(board)
+    text = hub_results.results_yaml(board, entry, args.dataset_id, source)
+    print(f"\n{path} in {args.hub}:\n{text}")
+    if source is None:
+        print(
+            "no source: --with-log puts the trial log beside the result, --source=URL names a published one"
+        )
+    if args.dry_run:
+        print("dry run: nothing was offered")
+        return
+    print(f"offered   {hub_results.offer_results(args.hub, {path: text.encode(), **logs})}")

@@ -25,6 +25,7 @@ COMMANDS = (
     "compare",
     "leaderboard",
     "publish",
+    "envhub",
     "pull",
     "inspect",
     "repair",

@@ -11,16 +11,24 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.datasets.benchmark import (
+    EVAL_FILE,
+    eval_yaml,
+    split_names,
+    viewer_config,
+    viewer_tables,
+)
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, FrameStore
 from lerobot_roborecover.datasets.licenses import license_metadata
 from lerobot_roborecover.datasets.pictures import grid_png, spread, stored_frame
 from lerobot_roborecover.datasets.read import read_with_manifest
-from lerobot_roborecover.datasets.schema import FOLDER, SCENARIOS_FILE, package_versions
+from lerobot_roborecover.datasets.schema import FOLDER, package_versions
 from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, TrajectorySet, read_trajectories
 from lerobot_roborecover.scenario import DeviationType, Scenario, ScenarioError, Stage
 
-GENERATED = "<!-- roborecover:card -->"
-"""Marks a card as made here, so that it is made again when the dataset is published again."""
+MARK = "roborecover:card"
+"""Marks a card or an `eval.yaml` as made here, so that publishing the dataset again makes it again."""
+GENERATED = f"<!-- {MARK} -->"
 GRID = "assets/recovery_frames.png"
 GRID_TILES = 12
 """Most pictures of the grid."""
@@ -33,7 +41,8 @@ class CardFiles:
     license: str
     """As in the Hub's metadata."""
     files: Mapping[str, bytes]
-    """`README.md` and its pictures by path in the repository."""
+    """By path in the repository: `README.md` and its pictures, and of scenarios `eval.yaml` and the viewer's
+    tables."""
 
 
 def make_card(
@@ -78,21 +87,29 @@ def _scenario_card(
     scenarios, manifest = read_with_manifest(root)
     known = license_metadata(license or manifest.get("license"))
     files: dict[str, bytes] = {}
-    if pictures:
-        tiles, store = [], FrameStore(root)
-        for row in spread(scenarios, GRID_TILES):
-            frame = frames.get(scenarios[row].id)
-            frame = stored_frame(root, scenarios, row, store) if frame is None else frame
-            if frame is not None:
-                tiles.append((scenarios[row].cell, scenarios[row].task.instruction, frame))
-        if tiles:
-            files[GRID] = grid_png(tiles)
+    store = FrameStore(root)
+
+    def frame_of(row: int) -> np.ndarray | None:
+        if not pictures:
+            return None
+        given = frames.get(scenarios[row].id)
+        return stored_frame(root, scenarios, row, store) if given is None else given
+
+    tiles = []
+    for row in spread(scenarios, GRID_TILES):
+        if (frame := frame_of(row)) is not None:
+            tiles.append((scenarios[row].cell, scenarios[row].task.instruction, frame))
+    if tiles:
+        files[GRID] = grid_png(tiles)
+    names = split_names(scenarios)
+    files |= viewer_tables(scenarios, frame_of, names)
+    files[EVAL_FILE] = eval_yaml(common["title"], scenarios[0].platform, len(scenarios), names)
     episodes = (root / "meta" / "info.json").is_file()
     platform = scenarios[0].platform
     split = [s.split for s in scenarios]
     text = render_card(
         "scenarios.md.j2",
-        metadata=_metadata(known, common["title"], platform, len(scenarios), _scenario_files(episodes)),
+        metadata=_metadata(known, common["title"], platform, len(scenarios), _configs(names, episodes)),
         **common,
         platform=platform,
         manifest={**manifest, "versions": package_versions(scenarios)},
@@ -160,8 +177,19 @@ def render_card(template: str, *, metadata: Mapping[str, Any], **values: Any) ->
     Raises:
         ScenarioError: the dataset's manifest lacks something that the template shows.
     """
-    import jinja2
     import yaml
+
+    front = yaml.safe_dump(dict(metadata), sort_keys=False, allow_unicode=True)
+    return f"---\n{front}---\n{GENERATED}\n\n{render_text(template, **values)}"
+
+
+def render_text(template: str, **values: Any) -> str:
+    """A template of `dataset_cards/` as text.
+
+    Raises:
+        ScenarioError: the dataset's manifest lacks something that the template shows.
+    """
+    import jinja2
 
     folder = importlib.resources.files("lerobot_roborecover") / "dataset_cards"
     environment = jinja2.Environment(
@@ -170,13 +198,11 @@ def render_card(template: str, *, metadata: Mapping[str, Any], **values: Any) ->
     environment.filters["plain"] = _plain
     source = (folder / template).read_text(encoding="utf-8")
     try:
-        text = environment.from_string(source).render(**values)
+        return environment.from_string(source).render(**values)
     except (jinja2.UndefinedError, AttributeError, TypeError) as err:
         raise ScenarioError(
             f"the dataset's manifest lacks what its card shows ({err}); write the dataset again"
         ) from None
-    front = yaml.safe_dump(dict(metadata), sort_keys=False, allow_unicode=True)
-    return f"---\n{front}---\n{GENERATED}\n\n{text}"
 
 
 def _plain(value: object) -> str:
@@ -187,12 +213,12 @@ def _plain(value: object) -> str:
     return text
 
 
-def _scenario_files(episodes: bool) -> list[dict[str, Any]]:
-    """Data files by config: what the Hub's viewer shows, the episodes first where there are some."""
-    scenarios = {"config_name": "scenarios", "data_files": f"{FOLDER}/{SCENARIOS_FILE}"}
-    if not episodes:
-        return [{**scenarios, "default": True}]
-    return [{"config_name": "default", "data_files": "data/*/*.parquet"}, scenarios]
+def _configs(splits: Mapping[str, str], episodes: bool) -> list[dict[str, Any]]:
+    """Data files by config: the Hub's viewer shows the scenarios, and the episodes where there are some."""
+    found = [viewer_config(splits)]
+    if episodes:
+        found.append({"config_name": "episodes", "data_files": "data/*/*.parquet"})
+    return found
 
 
 def _crosstab(

@@ -22,8 +22,9 @@ _MAX_EXPANSION = 1000
 _SLACK_BYTES = 2**26
 
 _ALLOWED = (
-    r"README\.md|\.gitattributes|LICENSE(\.md|\.txt)?|CITATION\.(cff|bib)",
+    r"README\.md|eval\.yaml|\.gitattributes|LICENSE(\.md|\.txt)?|CITATION\.(cff|bib)",
     r"assets/[\w.-]+\.png",
+    r"viewer/[\w.-]+\.parquet",
     r"meta/([\w.-]+/)*[\w.-]+\.(parquet|json|jsonl)",
     r"data/([\w.-]+/)*[\w.-]+\.parquet",
     r"videos/([\w.-]+/)*[\w.-]+\.mp4",
@@ -49,7 +50,7 @@ def check_names(where: str, names: Iterable[str]) -> None:
                 "a kind of file that can run code when it is loaded, which is never pulled or published"
                 if name.lower().endswith(_CODE)
                 else "not part of a dataset (parquet and JSON below meta/, data/*.parquet, videos/*.mp4, "
-                "images/ and assets/*.png, README.md, LICENSE)"
+                "images/ and assets/*.png, viewer/*.parquet, eval.yaml, README.md, LICENSE)"
             )
             raise ScenarioError(f"{where}: {name[:200]!r} is {kind}. Remove it from the dataset")
     if count > MAX_FILES:

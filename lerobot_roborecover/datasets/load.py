@@ -21,7 +21,8 @@ __all__ = ["ScenarioSet", "builtin_names", "load_scenarios", "validate_for"]
 
 logger = logging.getLogger(__name__)
 
-_HUB_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}")
+HUB_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}")
+"""An id on the Hub: org/name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,7 @@ def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path,
         root = found[text]
     elif Path(text).expanduser().is_dir():
         root = Path(text).expanduser()
-    elif isinstance(source, str) and _HUB_ID.fullmatch(text):
+    elif isinstance(source, str) and HUB_ID.fullmatch(text):
         from lerobot_roborecover.datasets.hub import pull
 
         return pull(text, revision)

@@ -22,7 +22,8 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
-from lerobot_roborecover.datasets.card import GENERATED, CardFiles, make_card
+from lerobot_roborecover.datasets.benchmark import EVAL_FILE, VIEWER_FOLDER
+from lerobot_roborecover.datasets.card import MARK, CardFiles, make_card
 from lerobot_roborecover.datasets.contents import check_file, list_files
 from lerobot_roborecover.datasets.pull import validate
 from lerobot_roborecover.datasets.retries import ATTEMPTS, HubUnreachable, again
@@ -151,7 +152,8 @@ def plan_publish(
         frames=config.frames,
     )
     validate(root, thorough=True)
-    own = {name: root / name for name in names}
+    # The viewer's tables are made anew: one of a split that is gone does not stay.
+    own = {name: root / name for name in names if not name.startswith(f"{VIEWER_FOLDER}/")}
     local: dict[str, Path | bytes] = {**own}
     local |= {name: data for name, data in card.files.items() if name not in own or _replaceable(own[name])}
     api, where = HfApi(), f"Hub dataset {config.repo_id}"
@@ -308,7 +310,7 @@ def _source(plan: PublishPlan, name: str) -> bytes | str:
 
 
 def _replaceable(path: Path) -> bool:
-    """Whether a file of the dataset is a generated card, and not its owner's own words."""
-    if path.name != "README.md":
+    """Whether a file of the dataset was made here, and is not its owner's own."""
+    if path.name not in ("README.md", EVAL_FILE):
         return True
-    return GENERATED in path.read_text(encoding="utf-8", errors="replace")
+    return MARK in path.read_text(encoding="utf-8", errors="replace")

@@ -6,14 +6,12 @@ import re
 import signal
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -26,9 +24,10 @@ from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.render_device import egl_devices, render_environment
-from lerobot_roborecover.env.run import Run, group_name, open_run
+from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import TrialRow, check_retry
 from lerobot_roborecover.trials.engine import Engine, units_of
+from lerobot_roborecover.trials.eval_info import eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
 from lerobot_roborecover.trials.local import open_local_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
@@ -318,49 +317,6 @@ def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Seq
     print(f"\ntrial log {run.kept_log().path}\neval info {out / 'eval_info.json'}")
     if films:
         print(f"videos {films[0].parent} ({len(films)})")
-
-
-def eval_info(
-    rows: Sequence[TrialRow], group_by: str, videos: Mapping[tuple[str, int], str] | None = None
-) -> dict:
-    """The trials in the layout of `lerobot-eval`'s `eval_info.json`.
-
-    Args:
-        rows: of one protocol.
-        group_by: `suite`, `cell` or `source`.
-        videos: films by scenario and trial.
-    """
-    films = videos or {}
-    tasks: dict[tuple[str, str], list[TrialRow]] = defaultdict(list)
-    for row in rows:
-        tasks[group_name(row, group_by), row.scenario_id].append(row)
-    per_task, groups = [], defaultdict(list)
-    for (group, scenario_id), trials in sorted(tasks.items()):
-        successes = [t.success for t in sorted(trials, key=lambda t: t.trial)]
-        rewards = [float(s) for s in successes]
-        paths = [films[scenario_id, t.trial] for t in trials if (scenario_id, t.trial) in films]
-        metrics = {
-            "sum_rewards": rewards,
-            "max_rewards": rewards,
-            "successes": successes,
-            "video_paths": paths,
-        }
-        per_task.append({"task_group": group, "task_id": scenario_id, "metrics": metrics})
-        groups[group] += rewards
-
-    def aggregate(rewards: list[float]) -> dict:
-        mean = float(np.mean(rewards)) if rewards else None
-        percent = None if mean is None else 100 * mean
-        return {
-            "avg_sum_reward": mean, "avg_max_reward": mean, "pc_success": percent, "n_episodes": len(rewards),
-            "video_paths": [],
-        }  # fmt: skip
-
-    return {
-        "per_task": per_task,
-        "per_group": {group: aggregate(rewards) for group, rewards in groups.items()},
-        "overall": aggregate([r for rewards in groups.values() for r in rewards]),
-    }
 
 
 def main(argv: Sequence[str]) -> int:

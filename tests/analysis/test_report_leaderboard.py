@@ -1,4 +1,4 @@
-"""`roborecover leaderboard`: boards of what may be compared, provenance, the page, and results on the Hub."""
+"""`roborecover leaderboard`: boards of what may be compared, provenance, and the page."""
 
 from __future__ import annotations
 
@@ -7,21 +7,16 @@ import math
 from dataclasses import replace
 
 import pytest
-import yaml
 
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.hub_results import file_name, find_entry, results_yaml
 from lerobot_roborecover.analysis.leaderboard import as_json, make_leaderboard, ranks
 from lerobot_roborecover.analysis.leaderboard_page import board_table, write_leaderboard
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.cli.main import main
 from tests.support.browser import open_page
-from tests.support.hub_client import HubClient
-from tests.support.hub_server import HubServer, Repo
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 QUICK = Options(draws=300)
-ON_HUB = {"dataset": "org/scenarios", "dataset_revision": "c0ffee"}
 
 
 def made(tmp_path, **groups):
@@ -127,68 +122,13 @@ def test_json_and_page(tmp_path):
         assert complaints == []
 
 
-def test_hub_metadata(tmp_path):
-    rows = policy_rows("a", 12, 2, 0.5, 0, **ON_HUB) + policy_rows(
-        "a", 12, 2, 0.9, 1, start="initial", **ON_HUB
-    )
-    found = made(tmp_path, a=rows)
-    board, entry = find_entry(found, None)
-    data = yaml.safe_load(results_yaml(board, entry))
-    assert [d["dataset"]["task_id"] for d in data] == [
-        "recovery_success_rate", "macro_recovery_success_rate", "initial_state_success_rate",
-    ]  # fmt: skip
-    assert data[0]["dataset"] | {"task_id": ""} == {
-        "id": "org/scenarios",
-        "task_id": "",
-        "revision": "c0ffee",
-    }
-    assert data[0]["value"] == pytest.approx(100 * entry.rsr.value, abs=0.006)
-    assert "12 scenarios, 24 trials, 0 invalid" in data[0]["notes"]
-    assert "revision" not in yaml.safe_load(results_yaml(board, entry, "other/set"))[0]["dataset"]
-    assert file_name(board) == ".eval_results/roborecover-org-scenarios-c0ffee-test.yaml"
-
-
-def test_what_is_not_pushed(tmp_path):
-    found = made(tmp_path, a=policy_rows("a", 12, 2, 0.5, 0), b=policy_rows("b", 6, 2, 0.5, 1))
-    with pytest.raises(RowsError, match="2 entries fit"):
-        find_entry(found, None)
-    board, entry = find_entry(found, "a")
-    with pytest.raises(RowsError, match="'made-up' is not a data set on the Hub"):
-        results_yaml(board, entry)
-    with pytest.raises(RowsError, match="b covers 6 of 12 scenarios"):
-        results_yaml(*find_entry(found, "b"), "org/set")
-
-
 def test_command(tmp_path, capsys):
     write_log(tmp_path / "logs" / "a.jsonl", policy_rows("a", 6, 2, 0.5, 0))
     common = ["leaderboard", str(tmp_path / "logs"), f"--out={tmp_path / 'out'}", "--draws=200"]
     assert main(common) == 0
     assert "libero: made-up@r1, test" in capsys.readouterr().out
-    assert main([*common, "--push-to=me/model", "--dataset-id=org/set", "--dry-run"]) == 0
-    assert "dry run: nothing was pushed" in capsys.readouterr().out
+    assert main([*common, "--hub=me/model", "--dataset-id=org/set", "--dry-run"]) == 0
+    assert "dry run: nothing was offered" in capsys.readouterr().out
     (tmp_path / "logs" / "bad.jsonl").write_text("{}\n")
     assert main(common) == 1
     assert "not used: bad.jsonl" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_results_arrive_beside_the_model_card(tmp_path):
-    """The real client against a server on loopback, from a process whose Hub is that server."""
-    write_log(tmp_path / "logs" / "a.jsonl", policy_rows("a", 6, 2, 0.5, 0, **ON_HUB))
-    with HubServer() as server:
-        server.repos["me/model"] = Repo()
-        server.repos["me/model"].commit({"README.md": b"# My model"})
-        server.failures.append(["POST", "/commit/", 503, 1])
-        client = HubClient(server, tmp_path, tmp_path)
-        command = ["leaderboard", tmp_path / "logs", f"--out={tmp_path / 'out'}", "--draws=200"]
-        done = client.roborecover(*command, "--push-to=me/model")
-        assert done.returncode == 0, done.stderr
-        repo = server.repos["me/model"]
-        files = repo.commits[repo.refs["main"]]
-        assert files["README.md"] == b"# My model"
-        (pushed,) = [name for name in files if name.startswith(".eval_results/")]
-        assert yaml.safe_load(files[pushed])[0]["dataset"]["id"] == "org/scenarios"
-        refused = client.roborecover(*command, "--push-to=me/none")
-    assert refused.returncode == 2
-    assert "Hub model me/none" in refused.stderr
-    assert "Traceback" not in refused.stderr

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, unquote, urlsplit
 
+import yaml
+
 from tests.support.processes import PATIENCE_S
 
 TOKEN = "hf_test"
@@ -28,6 +30,8 @@ class Repo:
 
     commits: dict[str, dict[str, bytes]] = field(default_factory=dict)
     refs: dict[str, str] = field(default_factory=dict)
+    pull_requests: list[str] = field(default_factory=list)
+    """Commits on offer."""
     gated: bool = False
     private: bool = False
 
@@ -142,6 +146,8 @@ class _Handler(BaseHTTPRequestHandler):
             (r"/lfs-part/(?P<oid>[0-9a-f]{64})/(?P<number>\d+)", self._lfs_part),
             (r"/lfs-complete", self._lfs_complete),
             (rf"/api/(?:datasets|models)/{repo_id}/commit/(?P<rev>[^/]+)", self._commit),
+            (rf"/api/datasets/{repo_id}/leaderboard", self._leaderboard),
+            (rf"/api/models/{repo_id}", self._model),
             (rf"/api/datasets/{repo_id}/tag/(?P<rev>[^/]+)", self._tag),
             (rf"/api/datasets/{repo_id}/refs", self._refs),
             (rf"/api/datasets/{repo_id}(?:/revision/(?P<rev>[^/]+))?", self._info),
@@ -265,9 +271,55 @@ class _Handler(BaseHTTPRequestHandler):
                 files[value["path"]] = base64.b64decode(value["content"])
             elif entry["key"] == "lfsFile":
                 files[value["path"]] = self.server.lfs[value["oid"]]
-        sha = self.server.repos[repo].commit(files, rev)
-        url = f"{self.server.endpoint}/datasets/{repo}/commit/{sha}"
-        self._send(200, {"success": True, "commitOid": sha, "commitUrl": url})
+        offered = parse_qs(urlsplit(self.path).query).get("create_pr") == ["1"]
+        found = self.server.repos[repo]
+        number = len(found.pull_requests) + 1
+        sha = found.commit(files, f"refs/pr/{number}" if offered else rev)
+        answer = {
+            "success": True,
+            "commitOid": sha,
+            "commitUrl": f"{self.server.endpoint}/datasets/{repo}/commit/{sha}",
+        }
+        if offered:
+            found.pull_requests.append(sha)
+            answer["pullRequestUrl"] = f"{self.server.endpoint}/{repo}/discussions/{number}"
+        self._send(200, answer)
+
+    def _results_of(self, repo: str) -> list[tuple[str, dict, int | None]]:
+        """File, entry and pull request of all evaluation results of a model, those on offer among them."""
+        found = self.server.repos[repo]
+        trees = [(found.refs["main"], None), *((sha, n + 1) for n, sha in enumerate(found.pull_requests))]
+        return [
+            (name, entry, number)
+            for sha, number in trees
+            for name, data in found.commits[sha].items()
+            if name.startswith(".eval_results/")
+            for entry in yaml.safe_load(data)
+        ]
+
+    def _leaderboard(self, body, repo):
+        if "eval.yaml" not in self.server.repos[repo].commits[self.server.repos[repo].refs["main"]]:
+            self._send(404, {"error": "This dataset has no leaderboard"})
+            return
+        best: dict[str, tuple] = {}
+        for model in self.server.repos:
+            for name, entry, number in self._results_of(model):
+                if entry["dataset"]["id"] == repo:
+                    best.setdefault(model, (entry, name, number))
+        ranked = sorted(best.items(), key=lambda item: -item[1][0]["value"])
+        answer = [
+            {
+                "rank": rank, "modelId": model, "value": entry["value"], "filename": name, "verified": False,
+                "source": entry.get("source"), "author": {"type": "user", "name": "me", "fullname": "Me"},
+                "pullRequest": number, "notes": entry.get("notes"),
+            }
+            for rank, (model, (entry, name, number)) in enumerate(ranked, 1)
+        ]  # fmt: skip
+        self._send(200, answer)
+
+    def _model(self, body, repo):
+        results = [{"filename": name, "data": entry} for name, entry, _ in self._results_of(repo)]
+        self._send(200, {"id": repo, "evalResults": results})
 
     def _tag(self, body, repo, rev):
         refs = self.server.repos[repo].refs

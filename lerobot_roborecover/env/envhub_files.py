@@ -1,0 +1,59 @@
+"""Writes the files of an EnvHub repository: `env.py`, which runs, and a card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lerobot_roborecover.datasets.card import render_card, render_text
+from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
+from lerobot_roborecover.env.envhub import HubScenarios
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.whole import write_whole
+
+_EXTRAS = {"libero": "libero", "robotwin": "robotwin", "lerobot": "gym"}
+
+
+def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | None = None) -> list[Path]:
+    """Writes the repository's folder; what is in it of other names stays.
+
+    Args:
+        scenarios: as loaded; a set of the Hub is named with the commit that was read.
+        out: the folder; made if need be.
+        repo_id: "org/name" that the environment will have on the Hub.
+        split: that the scenarios were loaded with.
+
+    Raises:
+        OptionError: the id is none, or the set is a folder, which nobody else has.
+    """
+    if not HUB_ID.fullmatch(repo_id):
+        raise OptionError(f"--repo-id {repo_id!r:.120}: write it like org/name")
+    if Path(scenarios.source).expanduser().is_dir() and scenarios.revision is None:
+        raise OptionError(
+            f"scenarios {scenarios.source!r:.200}: a folder, which others do not have. Publish it "
+            "(roborecover publish), and name it as org/name"
+        )
+    platform = platform_named(scenarios.platform)
+    offer = HubScenarios(platform.name, scenarios.source, scenarios.revision, split)
+    values = {
+        "platform": offer.platform,
+        "scenarios": offer.scenarios,
+        "revision": offer.revision,
+        "split": offer.split,
+        "total": len(scenarios),
+    }
+    env_name = platform.env_name or platform.name
+    card = render_card(
+        "envhub.md.j2",
+        metadata={"tags": ["LeRobot", "RoboRecover", "robotics", "envhub"], "library_name": "lerobot"},
+        title=repo_id.split("/")[-1],
+        repo_id=repo_id,
+        on_hub=bool(HUB_ID.fullmatch(offer.scenarios)),
+        extra=_EXTRAS.get(env_name, ""),
+        env_name=env_name,
+        **values,
+    )
+    texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}
+    for name, text in texts.items():
+        write_whole(out / name, text)
+    return [out / name for name in texts]

@@ -1,0 +1,81 @@
+"""`eval_info.json` as `lerobot-eval` lays it out, made from trial rows."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lerobot_roborecover.analysis.intervals import rate_interval, spread
+from lerobot_roborecover.env.run import group_name
+from lerobot_roborecover.env.trial_log import TrialRow
+
+
+def eval_info(
+    rows: Sequence[TrialRow], group_by: str, videos: Mapping[tuple[str, int], str] | None = None
+) -> dict:
+    """The trials in the layout of `lerobot-eval`'s `eval_info.json`.
+
+    Args:
+        rows: of one protocol.
+        group_by: `suite`, `cell` or `source`.
+        videos: films by scenario and trial.
+    """
+    films = videos or {}
+    tasks: dict[tuple[str, str], list[TrialRow]] = defaultdict(list)
+    for row in rows:
+        tasks[group_name(row, group_by), row.scenario_id].append(row)
+    per_task, groups = [], defaultdict(list)
+    for (group, scenario_id), trials in sorted(tasks.items()):
+        successes = [t.success for t in sorted(trials, key=lambda t: t.trial)]
+        rewards = [float(s) for s in successes]
+        paths = [films[scenario_id, t.trial] for t in trials if (scenario_id, t.trial) in films]
+        metrics = {
+            "sum_rewards": rewards,
+            "max_rewards": rewards,
+            "successes": successes,
+            "video_paths": paths,
+        }
+        per_task.append(
+            {"task_group": group, "task_id": scenario_id, "metrics": metrics, **success_counts([rewards])}
+        )
+        groups[group].append(rewards)
+
+    def aggregate(scenarios: list[list[float]]) -> dict:
+        rewards = [r for trials in scenarios for r in trials]
+        mean = float(np.mean(rewards)) if rewards else None
+        return {
+            "avg_sum_reward": mean, "avg_max_reward": mean, **success_counts(scenarios), "video_paths": [],
+        }  # fmt: skip
+
+    return {
+        "per_task": per_task,
+        "per_group": {group: aggregate(scenarios) for group, scenarios in groups.items()},
+        "overall": aggregate([trials for scenarios in groups.values() for trials in scenarios]),
+    }
+
+
+def success_counts(scenarios: list[list[float]]) -> dict:
+    """Counts, rate and interval in per cent, under the keys of LeRobot after 0.6.1.
+
+    The interval is the one of all our tables, over scenarios, since trials of one scenario are alike; of a
+    single scenario it is over its trials. None where a single trial, or none, says nothing.
+
+    Args:
+        scenarios: each one's trials, 1.0 for a success.
+    """
+    trials = [t for own in scenarios for t in own]
+    units = [[t] for t in trials] if len(scenarios) == 1 else scenarios
+    bounds = None
+    if len(units) > 1:
+        found = spread(
+            np.array([np.mean(own) for own in units]), weights=np.array([float(len(own)) for own in units])
+        )
+        bounds = [100 * float(bound) for bound in rate_interval(found)]
+    return {
+        "pc_success": 100 * sum(trials) / len(trials) if trials else None,
+        "pc_success_ci95": bounds,
+        "n_success": int(sum(trials)),
+        "n_episodes": len(trials),
+    }
