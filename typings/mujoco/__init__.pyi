@@ -81,6 +81,7 @@ class MjModel:
     geom_conaffinity: np.ndarray
     geom_contype: np.ndarray
     geom_dataid: np.ndarray
+    geom_group: np.ndarray
     geom_matid: np.ndarray
     geom_size: np.ndarray
     geom_type: np.ndarray
@@ -98,6 +99,13 @@ class MjModel:
     mesh_facenormal: np.ndarray
     mesh_facenum: np.ndarray
     mesh_facetexcoord: np.ndarray
+    mesh_graphadr: np.ndarray
+    mesh_normal: np.ndarray
+    mesh_normaladr: np.ndarray
+    mesh_normalnum: np.ndarray
+    mesh_texcoord: np.ndarray
+    mesh_texcoordadr: np.ndarray
+    mesh_texcoordnum: np.ndarray
     mesh_vert: np.ndarray
     mesh_vertadr: np.ndarray
     mesh_vertnum: np.ndarray

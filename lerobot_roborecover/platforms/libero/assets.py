@@ -188,6 +188,11 @@ def _configured() -> list[Path]:
     return [Path(match[1]).expanduser()] if match else []
 
 
+def cache_folder() -> Path:
+    """Of what can be made again; it need not exist."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roborecover"
+
+
 def _private_config(assets: Path) -> Path:
     """A folder with a config.yaml for LIBERO's import, shared by all processes that use the same packages."""
     root = package_root()
@@ -202,7 +207,7 @@ def _private_config(assets: Path) -> Path:
         }.items()
     )
     name = f"libero-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roborecover"
+    base = cache_folder()
     try:
         base.mkdir(parents=True, exist_ok=True)
         folder = base / name

@@ -32,9 +32,9 @@ class LiberoConfig(LiberoEnv, FilmedEnvConfig):
     """LIBERO's asset folder; empty: `$ROBORECOVER_LIBERO_ASSETS`, LIBERO's own configuration, then the
     Hub."""
     render_quality: str = "full"
-    """`full`, as LeRobot renders; or `fast`, without shadows, reflections and smoothing and with a coarser
-    robot, some six times as fast where there is no GPU. Other pictures, so another experiment for a policy
-    that looks at them; the physics is the same."""
+    """`full`, as LeRobot renders; or `fast`, without shadows, reflections and smoothing and with coarser
+    meshes, at a tenth of the cost or so where there is no GPU. Other pictures, so another experiment for a
+    policy that looks at them; the physics is the same."""
 
     def processors_for(self, policy_cfg: PreTrainedConfig) -> None:
         """LeRobot's choice is right here."""

@@ -53,7 +53,7 @@ class LiberoSimulator:
         control_mode: what the policy's actions are: `relative` or `absolute`.
         fps: control steps per simulated second.
         render_quality: `full` is LeRobot's, bit for bit; `fast` leaves out shadows, reflections,
-            multisampling and faces that are smaller than a pixel. The physics is the same.
+            multisampling and most of the meshes' faces. The physics is the same.
 
     Raises:
         SimulatorError: an option is out of range, or LIBERO or its assets are missing.

@@ -7,6 +7,7 @@ import atexit
 import mujoco
 import numpy as np
 
+from lerobot_roborecover.platforms.libero.assets import cache_folder
 from lerobot_roborecover.platforms.libero.fast import light_copy, without_reflections
 from lerobot_roborecover.platforms.libero.goal_state import GoalState
 from lerobot_roborecover.platforms.libero.task import LiberoTask
@@ -162,7 +163,9 @@ class LiberoView:
         self._frames.clear()
 
     def _make_renderer(self) -> mujoco.Renderer:
-        model = light_copy(self._task.model) if self._fast else self._task.model
+        model = self._task.model
+        if self._fast:
+            model = light_copy(model, max(self._height, self._width), cache_folder() / "meshes")
         size = model.vis.global_
         size.offwidth, size.offheight = max(size.offwidth, self._width), max(size.offheight, self._height)
         try:
