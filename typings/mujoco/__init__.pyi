@@ -117,6 +117,7 @@ class MjModel:
     def from_xml_string(xml: str) -> MjModel: ...
     def body(self, which: int | str) -> _Named: ...
     def camera(self, which: int | str) -> _Named: ...
+    def joint(self, which: int | str) -> _Named: ...
 
 class _Contacts:
     geom: np.ndarray
@@ -136,6 +137,8 @@ class MjData:
     site_xpos: np.ndarray
     warning: list[_Warning]
     xipos: np.ndarray
+    xanchor: np.ndarray
+    xaxis: np.ndarray
     xmat: np.ndarray
     xpos: np.ndarray
     xquat: np.ndarray

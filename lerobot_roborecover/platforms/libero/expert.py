@@ -1,46 +1,30 @@
-"""A scripted driver for LIBERO's pick-and-place tasks, from privileged state, with flaws to switch on.
+"""The scripted driver of LIBERO's tasks, from privileged simulator state, with flaws to switch on.
 
 Without flaws it is the expert that proves scenarios recoverable and makes demonstrations; with them it is a
-weaker driver whose failures are real rollouts. It knows `On` and `In` goals, one after the other; drawers,
-knobs and doors are beyond it.
+weaker driver whose failures are real rollouts. It takes up a task's goals one after the other, each with a
+driver of its kind, and tries again what has not worked or came undone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
+from lerobot_roborecover.platforms.libero.articulated import (
+    DoorPush,
+    DrawerPull,
+    DrawerPush,
+    JointMotion,
+    KnobTurn,
+)
+from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
+from lerobot_roborecover.platforms.libero.pick_place import PickPlace
+from lerobot_roborecover.platforms.libero.push import RimSlide
+from lerobot_roborecover.platforms.libero.scene import PICK_AND_PLACE, PREDICATES, Goal, LiberoScene
 
-_OPEN, _CLOSED = -1.0, 1.0
-_STEP_M, _STEP_RAD = 0.05, 0.5
-"""What a full translation or rotation command asks for (robosuite's OSC_POSE)."""
-_HOLLOW = ("bowl", "mug")
-"""Objects wider than the gripper, to be grasped by the rim."""
+__all__ = ["Flaws", "LiberoExpert"]
 
-
-@dataclass(frozen=True)
-class Flaws:
-    """What is wrong with a weaker driver; all off for the expert."""
-
-    aim_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Constant error of the grasp, in the world."""
-    turn_rad: float = 0.0
-    """Constant error of the closing direction, about the vertical."""
-    item: str = ""
-    """Grasps this object whatever the goal says."""
-    region: str = ""
-    """Brings the object here whatever the goal says."""
-    place_m: tuple[float, float] = (0.0, 0.0)
-    """Constant error of the place where the object is put down."""
-    carry_m: float = 0.0
-    """Constant error of the transport's height."""
-    drop_after: int = 0
-    """Opens the gripper this many steps into the transport; 0 never does."""
-    open_loop: bool = False
-    """Plans once, never looks whether it holds anything, and rests after one attempt."""
+_WIDE = "plate"
+"""What no gripper spans."""
 
 
 class LiberoExpert:
@@ -53,252 +37,37 @@ class LiberoExpert:
 
     def __init__(self, scene: LiberoScene, flaws: Flaws | None = None):
         self._scene, self._flaws = scene, flaws or Flaws()
-        self._tries = 0
-        self._choose()
+        self._goals = sorted(scene.goals, key=lambda goal: PREDICATES[goal.predicate[0]])
+        self._motion = self._next()
 
     def act(self) -> np.ndarray:
         """The next (7,) float64 relative OSC action."""
-        self._steps += 1
-        action = getattr(self, f"_{self.phase}")()
-        return np.clip(action, -1.0, 1.0)
+        if self._motion.done:
+            self._motion = self._next()
+        return self._motion.act()
 
-    def _choose(self) -> None:
-        """Takes up the first goal that is not reached, in the middle if its object is already held."""
-        goals = self._scene.goals
-        pending = [g for g in goals if not self._scene.reached(g)] or goals[-1:]
-        if not pending:
-            raise ValueError("the task has no pick-and-place goal for the scripted driver")
-        goal = next((g for g in pending if self._scene.holds(g.item)), pending[0])
-        self.goal = Goal(goal.predicate, self._flaws.item or goal.item, self._flaws.region or goal.region)
-        if self._scene.holds(self.goal.item) and not self._flaws.open_loop:
-            self._lift_from = self._item_bottom()
-            self._grip_rotation = self._scene.hand_rotation
-            self._enter("lift")
-        else:
-            self._plan()
-            self._enter("release" if self._blocked() else "above")
+    def _next(self) -> ArmMotion:
+        """The driver of the first goal that is not reached; of all that come together if it is to place."""
+        scene, flaws = self._scene, self._flaws
+        pending = [g for g in self._goals if not scene.reached(g)] or self._goals[-1:]
+        first = pending[0]
+        if first.predicate[0] == "in" and scene.drawer(first.region) is not None:
+            opened = Goal(("open", first.region), first.region)
+            if not scene.reached(opened):
+                return DrawerPull(scene, opened, flaws)
+        if _WIDE in first.item:
+            return RimSlide(scene, first, flaws)
+        if first.predicate[0] in PICK_AND_PLACE:
+            return PickPlace(scene, [g for g in self._goals if g.predicate[0] in PICK_AND_PLACE], flaws)
+        return _joint_motion(scene, first, flaws)
 
-    def _enter(self, phase: str) -> None:
-        self.phase, self._steps = phase, 0
 
-    def _blocked(self) -> bool:
-        return any(self._scene.holds(name) for name in self._scene.objects)
-
-    def _item_bottom(self) -> float:
-        return float(self._scene.cloud_m(self.goal.item)[:, 2].min())
-
-    # -- grasp --
-
-    def _plan(self) -> None:
-        """Where and along which axis the fingers close."""
-        cloud = self._scene.cloud_m(self.goal.item)
-        low, high = cloud.min(0), cloud.max(0)
-        self._top = float(high[2])
-        upright = self._scene.upright(self.goal.item) > 0.8
-        if upright and any(kind in self.goal.item for kind in _HOLLOW):
-            point, axis = self._rim_grasp(cloud)
-            height = self._top - 0.018
-        else:
-            point, axis = self._across_grasp(cloud)
-            depth = 0.035 if high[2] - low[2] > 0.07 else 0.022
-            height = max(float(low[2]) + 0.012, self._top - depth)
-        jitter = self._tries % 3
-        turn = self._tries * 2.1
-        point = point + 0.004 * jitter * np.array([np.cos(turn), np.sin(turn)])
-        self._grasp = np.array([*point, height - 0.004 * jitter]) + self._flaws.aim_m
-        flaw = self._flaws.turn_rad
-        turned = np.array([[np.cos(flaw), -np.sin(flaw)], [np.sin(flaw), np.cos(flaw)]]) @ axis
-        self._grip_rotation = self._down_along(turned)
-
-    def _rim_grasp(self, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A point on the rim with free space outside, and the axis through it; (2,) and (2,)."""
-        ring = cloud[cloud[:, 2] > self._top - 0.012]
-        center = (ring.min(0) + ring.max(0))[:2] / 2
-        radius = np.percentile(np.linalg.norm(ring[:, :2] - center, axis=1), 70) - 0.004
-        obstacles = self._obstacles()
-        grasps: list[tuple[float, np.ndarray, np.ndarray]] = []
-        for k in range(24):
-            angle = 2 * np.pi * (k + 0.5 * self._tries) / 24
-            axis = np.array([np.cos(angle), np.sin(angle)])
-            clearance = 0.2
-            if len(obstacles):
-                clearance = np.linalg.norm(
-                    obstacles[:, :2] - (center + (radius + 0.035) * axis), axis=1
-                ).min()
-            turn = np.arccos(min(1.0, abs(axis @ self._scene.closing_axis)))
-            score = 20 * min(clearance, 0.05) - 0.5 * turn
-            grasps.append((score, center + radius * axis, axis))
-        _, point, axis = max(grasps, key=lambda grasp: grasp[0])
-        return point, axis
-
-    def _across_grasp(self, cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """An object's middle, and of its narrow directions the one nearest to the fingers'; (2,) and (2,)."""
-        center = (cloud.min(0) + cloud.max(0))[:2] / 2
-        flat = cloud[:, :2] - center
-        angles = np.linspace(0, np.pi, 36, endpoint=False)
-        axes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        widths = np.ptp(flat @ axes.T, axis=0)
-        narrow = axes[widths < widths.min() + 0.006]
-        return center, narrow[np.argmax(np.abs(narrow @ self._scene.closing_axis))]
-
-    def _obstacles(self) -> np.ndarray:
-        """(n, 3) points of other objects and of fixtures that stand higher than the object's foot."""
-        names = [
-            n
-            for n in self._scene.env.obj_body_id
-            if n != self.goal.item and "table" not in n and n != "floor"
-        ]
-        clouds = [self._scene.cloud_m(name) for name in names]
-        points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
-        return points[points[:, 2] > self._item_bottom() + 0.015]
-
-    def _down_along(self, axis: np.ndarray) -> np.ndarray:
-        """(3, 3) hand rotation that points down and closes along ±axis, whichever is nearer."""
-        now, hand = self._scene.closing_axis, self._scene.hand_rotation
-        axis = axis if axis @ now >= 0 else -axis
-        yaw = np.arctan2(now[0] * axis[1] - now[1] * axis[0], now @ axis)
-        turned = Rotation.from_euler("z", yaw).as_matrix() @ hand
-        tilt = np.cross(turned[:, 2], [0.0, 0.0, -1.0])
-        sine = np.linalg.norm(tilt)
-        if sine > 1e-6:
-            angle = np.arctan2(sine, -turned[2, 2])
-            turned = Rotation.from_rotvec(tilt / sine * angle).as_matrix() @ turned
-        return turned
-
-    # -- motion --
-
-    def _rotation_error(self) -> np.ndarray:
-        return Rotation.from_matrix(self._grip_rotation @ self._scene.hand_rotation.T).as_rotvec()
-
-    def _toward(self, target_m: np.ndarray, grip: float, gain: float = 1.6, turn: bool = True) -> np.ndarray:
-        action = np.zeros(7)
-        action[:3] = (target_m - self._scene.hand_m) / _STEP_M * gain
-        if turn:
-            action[3:6] = np.clip(self._rotation_error() / _STEP_RAD * 1.5, -0.6, 0.6)
-        action[6] = grip
-        return action
-
-    def _up(self, grip: float, rise_m: float) -> np.ndarray:
-        return self._toward(self._scene.hand_m + np.array([0.0, 0.0, rise_m]), grip, turn=False)
-
-    def _retry(self) -> np.ndarray:
-        self._tries += 1
-        self._choose()
-        return self._up(_OPEN, 0.05)
-
-    # -- phases --
-
-    def _release(self) -> np.ndarray:
-        """Lets go of whatever is in the hand, then backs off."""
-        if self._steps > 14:
-            self._plan()
-            self._enter("above")
-        return self._up(_OPEN, 0.0 if self._steps < 6 else 0.06)
-
-    def _above(self) -> np.ndarray:
-        hand = self._scene.hand_m
-        off = np.linalg.norm(self._grasp[:2] - hand[:2])
-        hover = self._top + 0.09
-        if hand[2] < self._top + 0.06 and off > 0.03:  # up before sideways
-            return self._toward(np.array([*hand[:2], self._top + 0.12]), _OPEN)
-        near = 0.025 if self._flaws.open_loop else 0.006
-        arrived = off < near and abs(hand[2] - hover) < 0.03 and np.linalg.norm(self._rotation_error()) < 0.1
-        if arrived or self._steps > 90:
-            if not self._flaws.open_loop:
-                self._plan()
-            self._enter("down")
-        height = hover if off < 0.06 else max(self._top + 0.12, min(hand[2], self._top + 0.2))
-        return self._toward(np.array([*self._grasp[:2], height]), _OPEN)
-
-    def _down(self) -> np.ndarray:
-        hand = self._scene.hand_m
-        if hand[2] - self._grasp[2] < 0.006 or self._steps > 30:
-            self._hold = np.array([*hand[:2], min(hand[2], self._grasp[2] + 0.004)])
-            self._enter("close")
-        height = self._grasp[2] if np.linalg.norm(self._grasp[:2] - hand[:2]) < 0.012 else hand[2]
-        if self._flaws.open_loop:
-            height = self._grasp[2]
-        return self._toward(np.array([*self._grasp[:2], height]), _OPEN)
-
-    def _close(self) -> np.ndarray:
-        if self._steps > 10:
-            self._lift_from = self._item_bottom()
-            self._enter("lift")
-        return self._toward(self._hold, _CLOSED, turn=False)
-
-    def _lift(self) -> np.ndarray:
-        hand = self._scene.hand_m
-        clear = self._scene.rim_m(self.goal.region) + 0.05 + self._flaws.carry_m
-        if self._flaws.open_loop:
-            if hand[2] > clear + 0.08 or self._steps > 40:
-                self._enter("carry")
-            return self._up(_CLOSED, 0.08)
-        bottom = self._item_bottom()
-        if self._steps > 12 and not self._scene.holds(self.goal.item) and bottom - self._lift_from < 0.02:
-            return self._retry()
-        if bottom > clear - 0.01:
-            self._enter("carry")
-        elif self._steps > 60:
-            return self._retry()
-        return self._up(_CLOSED, float(np.clip(clear - bottom, 0.05, 0.08)))
-
-    def _goal_xy(self) -> np.ndarray:
-        return self._scene.center_m(self.goal.region)[:2] + self._flaws.place_m
-
-    def _carried_xy(self) -> np.ndarray:
-        """What is brought over the goal: the object's body, or the hand of a driver that does not look."""
-        if self._flaws.open_loop:
-            return self._scene.hand_m[:2]
-        return self._scene.position_m(self.goal.item)[:2]
-
-    def _lost(self) -> bool:
-        return not self._flaws.open_loop and not self._scene.holds(self.goal.item)
-
-    def _carry(self) -> np.ndarray:
-        if self._flaws.drop_after and self._steps > self._flaws.drop_after:
-            self._enter("open")
-        if self._lost():
-            return self._retry()
-        hand = self._scene.hand_m
-        way = self._goal_xy() - self._carried_xy()
-        if np.linalg.norm(way) < 0.010 or self._steps > 90:
-            self._enter("lower")
-        rise = self._scene.rim_m(self.goal.region) + 0.04 - self._item_bottom()
-        if self._flaws.open_loop:
-            rise = self._scene.rim_m(self.goal.region) + 0.12 + self._flaws.carry_m - hand[2]
-        return self._toward(np.array([*(hand[:2] + way), hand[2] + rise]), _CLOSED, gain=1.2)
-
-    def _lower(self) -> np.ndarray:
-        if self._lost():
-            return self._retry()
-        hand, bottom = self._scene.hand_m, self._item_bottom()
-        if "contain_region" in self.goal.region and "basket" in self.goal.region:
-            rest = self._scene.rim_m(self.goal.region) - 0.02
-        else:
-            under = np.array([*self._carried_xy(), bottom + 0.01])
-            rest = self._scene.support_m(under, ignore=self.goal.item) + 0.006
-        if bottom - rest < 0.006 or self._steps > 30:
-            self._enter("open")
-        way = self._goal_xy() - self._carried_xy()
-        drop = max(rest - bottom, -0.08)
-        if self._flaws.open_loop:
-            drop = self._scene.rim_m(self.goal.region) + 0.05 - hand[2]
-        return self._toward(np.array([*(hand[:2] + way), hand[2] + drop]), _CLOSED, gain=0.9)
-
-    def _open(self) -> np.ndarray:
-        if self._steps > 6:
-            self._enter("retreat")
-        return self._toward(self._scene.hand_m, _OPEN, turn=False)
-
-    def _retreat(self) -> np.ndarray:
-        if self._steps > 20:
-            if self._flaws.open_loop:
-                self._enter("rest")
-            else:
-                self._tries += 1
-                self._choose()
-        return self._up(_OPEN, 0.06)
-
-    def _rest(self) -> np.ndarray:
-        """Waits, as a driver that believes it is done."""
-        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, _OPEN])
+def _joint_motion(scene: LiberoScene, goal: Goal, flaws: Flaws) -> JointMotion:
+    kind = goal.predicate[0]
+    if kind in ("turnon", "turnoff"):
+        return KnobTurn(scene, goal, flaws)
+    if kind == "open":
+        return DrawerPull(scene, goal, flaws)
+    if scene.joint(goal.item).hinged:
+        return DoorPush(scene, goal, flaws)
+    return DrawerPush(scene, goal, flaws)

@@ -70,14 +70,14 @@ class LiberoPlatform(Platform):
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
     def cannot_drive(self, task: Task) -> str:
-        """The scripted drivers pick and place."""
+        """The scripted drivers know all predicates of the four suites."""
         from lerobot_roborecover.platforms.libero.catalog import libero_goal
-        from lerobot_roborecover.platforms.libero.scene import PICK_AND_PLACE
+        from lerobot_roborecover.platforms.libero.scene import PREDICATES
 
-        goal = libero_goal(task.suite, task.name)
-        if any(predicate[0] in PICK_AND_PLACE for predicate in goal):
+        unknown = [p for p in libero_goal(task.suite, task.name) if p[0] not in PREDICATES]
+        if not unknown:
             return ""
-        return "nothing is to be picked and placed: " + ", ".join(" ".join(predicate) for predicate in goal)
+        return "no scripted driver knows " + ", ".join(" ".join(predicate) for predicate in unknown)
 
     def short_name(self, task: Task) -> str:
         """With the suite: names occur in several."""
@@ -170,7 +170,7 @@ def _drawn_flaw(rng: np.random.Generator) -> dict[str, Any]:
 
 
 LiberoPlatform.experts = {
-    "scripted": _scripted(lambda _r: {}, "pick and place, tries again"),
+    "scripted": _scripted(lambda _r: {}, "every goal of a task in turn, tries again"),
     "scripted-open-loop": _scripted(lambda _r: {"open_loop": True}, "plans once, one attempt"),
     "scripted-weak": _scripted(_drawn_flaw, "one attempt with a flaw that it draws"),
 }

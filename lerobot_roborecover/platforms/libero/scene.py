@@ -8,24 +8,29 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from lerobot_roborecover.platforms.libero.joints import FixtureJoint
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.mujoco_state import subtree
 
+PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
+"""Predicates of a goal that the drivers know, and when their turn comes."""
 PICK_AND_PLACE = ("on", "in")
-"""Predicates of a goal that the driver knows."""
+"""Those about where an object is."""
+_ARM_M, _WRIST_M = 0.765, 0.21
+"""From the Panda's shoulder to its wrist when it is nearly stretched out; thence to the fingertips."""
 _BOX = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
 _COLLISION_GROUP = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One `On` or `In` predicate of a task's goal."""
+    """One predicate of a task's goal."""
 
     predicate: tuple[str, ...]
     """As LIBERO parsed it."""
     item: str
-    """Object to be moved."""
-    region: str
+    """Object to be moved; of a predicate about a joint, the fixture or the drawer."""
+    region: str = ""
     """Object or region where it belongs."""
 
 
@@ -43,9 +48,8 @@ class LiberoScene:
 
     @cached_property
     def goals(self) -> list[Goal]:
-        """The goal's pick-and-place predicates, in LIBERO's order."""
-        state = self.env.parsed_problem["goal_state"]
-        return [Goal(tuple(p), p[1], p[2]) for p in state if p[0] in PICK_AND_PLACE]
+        """The goal's predicates, in LIBERO's order."""
+        return [Goal(tuple(p), *p[1:]) for p in self.env.parsed_problem["goal_state"]]
 
     def reached(self, goal: Goal) -> bool:
         """LIBERO's own verdict on one predicate."""
@@ -72,6 +76,39 @@ class LiberoScene:
         left, right = (self._data.body(f"gripper0_{side}finger").xpos for side in ("left", "right"))
         axis = (left - right)[:2]
         return axis / max(np.linalg.norm(axis), 1e-6)
+
+    @property
+    def clear_m(self) -> float:
+        """Height of the hand, metres, at which it meets nothing on its way."""
+        return float(self.env.workspace_offset[2]) + 0.27
+
+    def reach_up_m(self, xy_m: np.ndarray) -> float:
+        """Greatest height of a hand that points down, metres, at which the arm is not yet stretched out:
+        there robosuite's controller lets go of the direction in which it is."""
+        shoulder = self._data.body("robot0_link2").xpos
+        left = _ARM_M**2 - float(np.sum((xy_m - shoulder[:2]) ** 2))
+        return float(shoulder[2]) - _WRIST_M + np.sqrt(max(left, 0.0))
+
+    def joint(self, name: str) -> FixtureJoint:
+        """Of a fixture, or of the drawer that a region belongs to."""
+        site = self.env.object_sites_dict.get(name)
+        names = self.env.get_object(name).joints if site is None else site.joints or []
+        return FixtureJoint(self._model, self._data, names[0])
+
+    def drawer(self, region: str) -> FixtureJoint | None:
+        """The slide of the drawer that a region is in, if it is in one."""
+        site = self.env.object_sites_dict.get(region)
+        joint = (
+            FixtureJoint(self._model, self._data, site.joints[0])
+            if site is not None and site.joints
+            else None
+        )
+        return None if joint is None or joint.hinged else joint
+
+    @property
+    def held(self) -> str:
+        """Name of the object between the fingers, if there is one."""
+        return next((name for name in self.objects if self.holds(name)), "")
 
     def holds(self, name: str) -> bool:
         """Whether both fingers touch an object."""
@@ -115,6 +152,9 @@ class LiberoScene:
         """Height of the highest thing that an object must clear on its way into a region, metres."""
         if region in self.env.obj_body_id:
             return float(self.cloud_m(region)[:, 2].max())
+        drawer = self.drawer(region)
+        if drawer is not None:
+            return drawer.top_m
         parent = self.env.object_sites_dict[region].__dict__.get("parent_name")
         if isinstance(parent, str) and parent in self.env.obj_body_id and "contain" in region:
             return float(self.cloud_m(parent)[:, 2].max())
@@ -142,4 +182,5 @@ class LiberoScene:
     def _collision_geoms(self, name: str) -> np.ndarray:
         bodies = subtree(self._model, [self.env.obj_body_id[name]])
         inside = np.isin(self._model.geom_bodyid, list(bodies))
-        return np.flatnonzero(inside & (self._model.geom_contype > 0))
+        found = np.flatnonzero(inside & (self._model.geom_contype > 0))
+        return found if len(found) else np.flatnonzero(inside & (self._model.geom_conaffinity > 0))

@@ -1,0 +1,88 @@
+"""What every scripted driver of LIBERO's arm is made of: flaws, phases, and commands towards a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_roborecover.platforms.libero.scene import LiberoScene
+
+OPEN, CLOSED = -1.0, 1.0
+"""Commands of the gripper."""
+_STEP_M, _STEP_RAD = 0.05, 0.5
+"""What a full translation or rotation command asks for (robosuite's OSC_POSE)."""
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """What is wrong with a weaker driver; all off for the expert."""
+
+    aim_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Constant error of the grasp, in the world."""
+    turn_rad: float = 0.0
+    """Constant error of the closing direction, about the vertical."""
+    item: str = ""
+    """Grasps this object whatever the goal says."""
+    region: str = ""
+    """Brings the object here whatever the goal says."""
+    place_m: tuple[float, float] = (0.0, 0.0)
+    """Constant error of the place where the object is put down."""
+    carry_m: float = 0.0
+    """Constant error of the transport's height."""
+    drop_after: int = 0
+    """Opens the gripper this many steps into the transport; 0 never does."""
+    open_loop: bool = False
+    """Plans once, never looks whether it holds anything, and rests after one attempt."""
+
+
+class ArmMotion:
+    """A driver of the arm in phases: `act` calls the method named after the phase.
+
+    Args:
+        scene: of the simulator's current reset.
+        flaws: errors to make.
+    """
+
+    def __init__(self, scene: LiberoScene, flaws: Flaws | None = None):
+        self._scene, self._flaws = scene, flaws or Flaws()
+        self._tries = 0
+        self._grip_rotation = scene.hand_rotation
+        """(3, 3) that the hand turns to."""
+        self.done = False
+        """Whether it has nothing left to do."""
+
+    def act(self) -> np.ndarray:
+        """The next (7,) float64 relative OSC action."""
+        self._steps += 1
+        action = getattr(self, f"_{self.phase}")()
+        return np.clip(action, -1.0, 1.0)
+
+    def _enter(self, phase: str) -> None:
+        self.phase, self._steps = phase, 0
+
+    def _rotation_error(self) -> np.ndarray:
+        return Rotation.from_matrix(self._grip_rotation @ self._scene.hand_rotation.T).as_rotvec()
+
+    def _toward(self, target_m: np.ndarray, grip: float, gain: float = 1.6, turn: bool = True) -> np.ndarray:
+        action = np.zeros(7)
+        action[:3] = (target_m - self._scene.hand_m) / _STEP_M * gain
+        if turn:
+            action[3:6] = np.clip(self._rotation_error() / _STEP_RAD * 1.5, -0.6, 0.6)
+        action[6] = grip
+        return action
+
+    def _up(self, grip: float, rise_m: float) -> np.ndarray:
+        return self._toward(self._scene.hand_m + np.array([0.0, 0.0, rise_m]), grip, turn=False)
+
+    def _rotation_along(self, pointing: np.ndarray, closing: np.ndarray) -> np.ndarray:
+        """(3, 3) hand rotation that points one way and closes along ±another, whichever is nearer.
+
+        Args:
+            pointing: (3,) unit vector.
+            closing: (3,) unit vector, at right angles to it.
+        """
+        if closing @ self._scene.hand_rotation[:, 0] < 0:
+            closing = -closing
+        return np.stack([closing, np.cross(pointing, closing), pointing], axis=1)
