@@ -190,7 +190,9 @@ class PickPlace(ArmMotion):
         off = np.linalg.norm(self._grasp[:2] - hand[:2])
         if not self._flaws.open_loop and self._moved():
             self._plan()
-        hover = min(self._top + 0.09, max(self._top + 0.035, self._scene.reach_up_m(self._grasp[:2])))
+        hover = self._top + 0.09
+        if not self._flaws.open_loop:
+            hover = min(hover, max(self._top + 0.035, self._scene.reach_up_m(self._grasp[:2])))
         if hand[2] < self._top + 0.06 and off > 0.03:  # up before sideways
             return self._toward(np.array([*hand[:2], self._top + 0.12]), OPEN)
         near = 0.025 if self._flaws.open_loop else 0.006
