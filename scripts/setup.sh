@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Sets up everything that the package, the demo and the tests need, in .venv inside the clone.
-# Safe to run again: does nothing when nothing has changed.
+# Safe to run again: does nothing when nothing has changed. With --system only the system's packages, for root.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -25,11 +25,19 @@ install_system_packages() {
         return 0
     fi
     say "installing system packages: ${missing[*]}"
-    local attempt log
+    local log known
     log="$(mktemp)"
-    for attempt in 1 2; do
-        if { apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
-            apt-get install -y -qq --no-install-recommends "${missing[@]}"; } >"$log" 2>&1; then
+    for _ in 1 2; do
+        apt-get update -qq >"$log" 2>&1 || true
+        # One that a distribution has not, such as Ubuntu's Chromium, is not to keep the others out.
+        known=()
+        for package in "${missing[@]}"; do
+            [[ "$(apt-cache policy "$package")" == *"Candidate: "[0-9]* ]] && known+=("$package")
+        done
+        if ((${#known[@]})) && DEBIAN_FRONTEND=noninteractive \
+            apt-get install -y -qq --no-install-recommends "${known[@]}" >>"$log" 2>&1; then
+            ((${#known[@]} == ${#missing[@]})) || say "not in this distribution: $(comm -23 \
+                <(printf '%s\n' "${missing[@]}" | sort) <(printf '%s\n' "${known[@]}" | sort) | xargs)"
             rm -f "$log"
             return 0
         fi
@@ -39,37 +47,25 @@ install_system_packages() {
     say "apt-get could not install ${missing[*]} ($log); going on without, 'roborecover doctor' says what is affected"
 }
 
-# Prints the command of a working uv, installing one for this clone alone where there is none. A private virtual
-# environment holds it, because Debian's Python refuses packages of its own users (PEP 668).
-find_uv() {
-    if uv --version >/dev/null 2>&1; then
-        echo uv
-        return 0
-    fi
-    local python
-    if [[ ! -x .tools/bin/uv ]]; then
-        for python in python3 /usr/bin/python3; do
-            "$python" -c 'import ensurepip' >/dev/null 2>&1 && break
-        done
-        "$python" -c 'import ensurepip' >/dev/null 2>&1 || install_system_packages python3-venv
-        say "installing uv in .tools"
-        "$python" -m venv --clear .tools
-        echo '*' >.tools/.gitignore
-        .tools/bin/python -m pip install --quiet --retries 5 uv || .tools/bin/python -m pip install --quiet uv
-    fi
-    echo .tools/bin/uv
-}
-
+if [[ "${1:-}" == --system ]]; then
+    # For machines where only this needs root: sudo scripts/setup.sh --system [PACKAGE...]
+    shift
+    (($#)) || set -- "${system_packages[@]}"
+    install_system_packages "$@"
+    exit 0
+fi
 install_system_packages "${system_packages[@]}"
 scripts/vulkan.sh >/dev/null || say "no software Vulkan: without a GPU, RoboTwin renders nothing here"
 
 stamp=".venv/.set-up"
-wanted="$(cat pyproject.toml constraints.txt .python-version scripts/setup.sh | sha256sum)"
+# Another file of versions, or /dev/null for the newest that pyproject.toml allows.
+constraints="${ROBORECOVER_CONSTRAINTS:-constraints.txt}"
+wanted="$(cat pyproject.toml "$constraints" .python-version scripts/setup.sh | sha256sum)"
 if [[ -f "$stamp" && "$(cat "$stamp")" == "$wanted" ]] && .venv/bin/python -c '' 2>/dev/null; then
     exit 0
 fi
 
-uv="$(find_uv)"
+uv="$(scripts/uv.sh)"
 if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; then
     # The first search stops at a broken interpreter, such as pyenv's stand-in for one that is not installed.
     "$uv" venv --quiet --clear --python 3.12 .venv || "$uv" venv --quiet --clear --managed-python --python 3.12 .venv || {
@@ -83,7 +79,7 @@ say "installing Python packages in .venv (some GB the first time)"
 install_python_packages() {
     # Compiled once, here: where PYTHONDONTWRITEBYTECODE is set, as in many images, every process would compile all of
     # LeRobot and torch anew, which takes it half a minute.
-    "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -c constraints.txt -e '.[gym,libero,robotwin,test]'
+    "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -c "$constraints" -e '.[gym,libero,robotwin,test]'
 }
 install_python_packages || { sleep 5; install_python_packages; }
 echo "$wanted" >"$stamp"

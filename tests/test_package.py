@@ -48,3 +48,18 @@ def test_reading_scenarios_needs_no_simulator():
         "torch",
         "mujoco",
     }
+
+
+def test_the_version_has_one_place():
+    import tomllib
+    from pathlib import Path
+
+    import yaml
+
+    from lerobot_roborecover import __version__
+
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text())
+    assert "version" not in project["project"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "lerobot_roborecover.__version__"}
+    assert yaml.safe_load((root / "CITATION.cff").read_text())["version"] == __version__

@@ -246,7 +246,7 @@ class Results:
 
         Raises:
             RowsError: it is no question of a family: an intervention against another policy, or another
-            intervention.
+                intervention.
         """
         for c in (*self.contrasts, *self.procedure_contrasts):
             if (c.a, c.b) == (a, b):

@@ -1,0 +1,21 @@
+#!/usr/bin/env bash
+# Prints the command of a working uv, installing one for this clone alone where there is none. A private virtual
+# environment holds it, because Debian's Python refuses packages of its own users (PEP 668).
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+if uv --version >/dev/null 2>&1; then
+    command -v uv
+    exit 0
+fi
+if [[ ! -x .tools/bin/uv ]]; then
+    for python in python3 /usr/bin/python3; do
+        "$python" -c 'import ensurepip' >/dev/null 2>&1 && break
+    done
+    "$python" -c 'import ensurepip' >/dev/null 2>&1 || scripts/setup.sh --system python3-venv
+    echo "uv: installing it in .tools" >&2
+    "$python" -m venv --clear .tools
+    echo '*' >.tools/.gitignore
+    .tools/bin/python -m pip install --quiet --retries 5 uv || .tools/bin/python -m pip install --quiet uv
+fi
+echo "$PWD/.tools/bin/uv"
