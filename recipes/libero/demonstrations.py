@@ -227,7 +227,7 @@ def main() -> None:
         Wanted(t, args.episodes_per_task, args.pictures, folder / f"{PLATFORM.short_name(t)}.npz")
         for t in tasks
     ]
-    missing = [w for w in wanted if not w.part.exists()]
+    missing = sorted((w for w in wanted if not w.part.exists()), key=lambda w: -w.task.horizon)
     with ProcessPoolExecutor(
         args.workers, multiprocessing.get_context("spawn"), max_tasks_per_child=1
     ) as pool:

@@ -1,4 +1,4 @@
-"""A LIBERO task's goal predicates, in an order in which they can be reached one after the other."""
+"""LIBERO's goal predicates, and an order in which a task's can be reached one after the other."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 GOAL_KINDS = ("on", "in", "open", "close", "turnon")
 """Every predicate of the four suites' goals."""
+PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
+"""Predicates of a goal that the drivers know, and when their turn comes."""
 
 
 def workable_order(predicates: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
-    """LIBERO's order, but what is to be closed is closed last: something has to go in before.
+    """LIBERO's order, but what is opened or turned on comes first, and what is closed comes last.
 
     Args:
         predicates: each with its arguments, e.g. `("in", "mug_1", "microwave_1_heating_region")`.
     """
-    return [tuple(p) for p in sorted(predicates, key=lambda p: p[0] == "close")]
+    return [tuple(p) for p in sorted(predicates, key=lambda p: PREDICATES.get(p[0], 1))]

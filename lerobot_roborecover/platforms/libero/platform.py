@@ -72,7 +72,7 @@ class LiberoPlatform(Platform):
     def cannot_drive(self, task: Task) -> str:
         """The scripted drivers know all predicates of the four suites."""
         from lerobot_roborecover.platforms.libero.catalog import libero_goal
-        from lerobot_roborecover.platforms.libero.scene import PREDICATES
+        from lerobot_roborecover.platforms.libero.goals import PREDICATES
 
         unknown = [p for p in libero_goal(task.suite, task.name) if p[0] not in PREDICATES]
         if not unknown:

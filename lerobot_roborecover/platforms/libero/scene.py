@@ -9,11 +9,10 @@ import mujoco
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.joints import FixtureJoint
+from lerobot_roborecover.platforms.libero.goals import PREDICATES
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.mujoco_state import subtree
 
-PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
-"""Predicates of a goal that the drivers know, and when their turn comes."""
 PICK_AND_PLACE = ("on", "in")
 """Those about where an object is."""
 _ARM_M, _WRIST_M = 0.765, 0.21
