@@ -10,7 +10,7 @@ from lerobot_roborecover.curation.attrition import count_stages, read_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.record import read_record
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.libero import scene
+from lerobot_roborecover.platforms.libero import goals
 from lerobot_roborecover.recording import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, Task
 from tests.support.factories import save_policy
@@ -222,7 +222,7 @@ def test_a_dry_run_lists_the_rollouts(tmp_path, capsys):
 
 @pytest.mark.libero
 def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, capsys, monkeypatch):
-    monkeypatch.delitem(scene.PREDICATES, "turnon")
+    monkeypatch.delitem(goals.PREDICATES, "turnon")
     command = ["collect", "--env.type=roborecover_libero", "--expert=scripted", "--init-states=0"]
     command += ["--dry-run", f"--out={tmp_path / 'out'}"]
     assert main([*command, "--task=libero_goal"]) == 0

@@ -16,10 +16,11 @@ from lerobot_roborecover.platforms.libero.articulated import (
     JointMotion,
     KnobTurn,
 )
+from lerobot_roborecover.platforms.libero.goals import PREDICATES
 from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
 from lerobot_roborecover.platforms.libero.pick_place import PickPlace
 from lerobot_roborecover.platforms.libero.push import RimSlide
-from lerobot_roborecover.platforms.libero.scene import PICK_AND_PLACE, PREDICATES, Goal, LiberoScene
+from lerobot_roborecover.platforms.libero.scene import PICK_AND_PLACE, Goal, LiberoScene
 
 __all__ = ["Flaws", "LiberoExpert"]
 

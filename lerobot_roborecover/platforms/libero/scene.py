@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.joints import FixtureJoint
-from lerobot_roborecover.platforms.libero.goals import PREDICATES
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.mujoco_state import subtree
 
