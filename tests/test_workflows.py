@@ -47,6 +47,7 @@ def test_one_version_of_every_tool():
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     (ruff,) = (repo["rev"].removeprefix("v") for repo in hooks if "ruff" in repo["repo"])
     assert f"ruff=={ruff}" in EXTRAS["lint"]
+    assert f"ruff=={ruff}" in EXTRAS["docs"], "which lays signatures out"
 
 
 def test_an_extra_can_be_had_alone():
