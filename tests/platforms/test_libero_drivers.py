@@ -16,6 +16,8 @@ pytestmark = pytest.mark.libero
 KINDS = {
     "goal:0": "a drawer is pulled open",
     "10:3": "a drawer is pushed closed over what was put inside",
+    "10:8": "two pots stand beside one another",
+    "10:9": "a mug goes into a microwave and its door is pushed closed",
     "goal:5": "a plate slides",
     "goal:7": "a knob is turned",
     "goal:8": "a bowl is put down beside a cabinet",

@@ -17,6 +17,7 @@ from lerobot_roborecover.platforms.libero.articulated import (
     KnobTurn,
 )
 from lerobot_roborecover.platforms.libero.goals import PREDICATES
+from lerobot_roborecover.platforms.libero.insert import PlaceInside, on_sill
 from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
 from lerobot_roborecover.platforms.libero.pick_place import PickPlace
 from lerobot_roborecover.platforms.libero.push import RimSlide
@@ -50,7 +51,7 @@ class LiberoExpert:
     def _next(self) -> ArmMotion:
         """The driver of the first goal that is not reached; of all that come together if it is to place."""
         scene, flaws = self._scene, self._flaws
-        pending = [g for g in self._goals if not scene.reached(g)] or self._goals[-1:]
+        pending = [g for g in self._goals if not (scene.reached(g) or on_sill(scene, g))] or self._goals[-1:]
         first = pending[0]
         if first.predicate[0] == "in" and scene.drawer(first.region) is not None:
             opened = Goal(("open", first.region), first.region)
@@ -59,7 +60,8 @@ class LiberoExpert:
         if _WIDE in first.item:
             return RimSlide(scene, first, flaws)
         if first.predicate[0] in PICK_AND_PLACE:
-            return PickPlace(scene, [g for g in self._goals if g.predicate[0] in PICK_AND_PLACE], flaws)
+            kind = PickPlace if scene.door(first.region) is None else PlaceInside
+            return kind(scene, [g for g in self._goals if g.predicate[0] in PICK_AND_PLACE], flaws)
         return _joint_motion(scene, first, flaws)
 
 

@@ -23,6 +23,8 @@ class FixtureJoint:
         self._model, self._data, self._id = model, data, model.joint(name).id
         of_body = model.geom_bodyid == model.jnt_bodyid[self._id]
         self._geoms = np.flatnonzero(of_body & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
+        self._panel = self._geoms[np.argmax(np.prod(model.geom_size[self._geoms], axis=1))]
+        self._address = int(model.jnt_qposadr[self._id])
         low, high = model.jnt_range[self._id]
         self._away = -1.0 if -low > high else 1.0
         """Sign of the coordinate away from closed or off, which is about zero."""
@@ -44,6 +46,14 @@ class FixtureJoint:
     def opening(self) -> np.ndarray:
         """(3,) unit vector along which a drawer opens."""
         return self._away * self.axis
+
+    @property
+    def outward(self) -> np.ndarray:
+        """(3,) unit vector out of the opening that a door closes."""
+        along = self._longest_level(self._panel)
+        along = along if along @ (self._data.geom_xpos[self._panel] - self.anchor_m) > 0 else -along
+        closed = Rotation.from_rotvec(-float(self._data.qpos[self._address]) * self.axis).apply(along)
+        return self._away * np.cross(self.axis, closed)
 
     @property
     def handle_m(self) -> np.ndarray:
@@ -69,7 +79,7 @@ class FixtureJoint:
             off_m: distance from the face.
             ahead_rad: turned so far about the hinge, towards closed.
         """
-        panel = self._geoms[np.argmax(np.prod(self._model.geom_size[self._geoms], axis=1))]
+        panel = self._panel
         center, anchor = self._data.geom_xpos[panel], self.anchor_m
         along = self._longest_level(panel)
         along = along if along @ (center - anchor) > 0 else -along

@@ -50,6 +50,8 @@ class ArmMotion:
         self._tries = 0
         self._grip_rotation = scene.hand_rotation
         """(3, 3) that the hand turns to."""
+        self._straight = 0
+        """Steps for which the elbow has been straight."""
         self.done = False
         """Whether it has nothing left to do."""
 
@@ -70,6 +72,11 @@ class ArmMotion:
         action[:3] = (target_m - self._scene.hand_m) / _STEP_M * gain
         if turn:
             action[3:6] = np.clip(self._rotation_error() / _STEP_RAD * 1.5, -0.6, 0.6)
+            self._straight = self._straight + 1 if self._scene.stretched else 0
+            if not self._flaws.open_loop and self._straight > 20:
+                # Turning a hand at the end of a straight arm only holds the elbow straight. Not quite zero:
+                # then the controller would go on with the turn before.
+                action[3:6] *= 1e-3
         action[6] = grip
         return action
 

@@ -12,6 +12,8 @@ from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
 
 _HOLLOW = ("bowl", "mug")
 """Objects wider than the gripper, to be grasped by the rim."""
+_BESIDE_M = 0.1
+"""From the middle of one object to that of another that shares its region."""
 _FINGERS = tuple((along_m, -0.01) for along_m in (-0.05, 0.04, 0.055))
 _PALM = tuple((float(along_m), 0.09) for along_m in np.linspace(-0.1, 0.1, 9))
 """Where the open hand is, from the grip site: along the axis, and the height from which on up."""
@@ -85,7 +87,6 @@ class PickPlace(ArmMotion):
         radius = np.percentile(np.linalg.norm(ring[:, :2] - center, axis=1), 70) - 0.004
         obstacles = self._obstacles()
         way = self._way_to_rest()
-        drawer = self._scene.drawer(self.goal.region)
         grasps: list[tuple[float, np.ndarray, np.ndarray]] = []
         for k in range(24):
             angle = 2 * np.pi * (k + 0.5 * self._tries) / 24
@@ -102,12 +103,16 @@ class PickPlace(ArmMotion):
                 grasp_m = np.array([*point, self._top - 0.018])
                 score -= 0.3 * self._in_the_way(grasp_m, axis, _FINGERS + _PALM)
                 score -= 0.3 * self._in_the_way(grasp_m + way, axis, _PALM)
-            score -= max(0.0, axis @ self._stuck)
-            if drawer is not None:  # too narrow for the hand the other way
-                score -= abs(axis @ drawer.opening[:2])
+            score += self._preference(axis) - max(0.0, axis @ self._stuck)
             grasps.append((score, point, axis))
         _, point, axis = max(grasps, key=lambda grasp: grasp[0])
         return point, axis
+
+    def _preference(self, axis: np.ndarray) -> float:
+        """What a side of the rim has for it because of the place that the object goes to."""
+        drawer = self._scene.drawer(self.goal.region)
+        # A drawer is too narrow for the hand the other way.
+        return 0.0 if drawer is None else -abs(float(axis @ drawer.opening[:2]))
 
     def _way_to_rest(self) -> np.ndarray:
         """(3,) metres from where the object is to where it belongs."""
@@ -234,8 +239,12 @@ class PickPlace(ArmMotion):
         if self._steps < 20 and self._lifts_another():
             self._stuck = self._grasp[:2] - self._scene.position_m(self.goal.item)[:2]
             self._stuck /= max(np.linalg.norm(self._stuck), 1e-6)
-            return self._retry()
+            self._retry()
+            self._enter("release")
+            return self._up(OPEN, 0.0)
         if bottom > clear - 0.01:
+            if self._shares():
+                self._grip_rotation = self._down_along(np.array([0.0, 1.0]))
             self._enter("carry")
         elif self._steps > 60:
             return self._retry()
@@ -257,12 +266,36 @@ class PickPlace(ArmMotion):
         return max(rim, max(tops) + 0.02)
 
     def _lifts_another(self) -> bool:
-        """Whether another object, wedged to this one, has come along."""
-        others = (name for name in self._scene.objects if name != self.goal.item)
-        return any(self._scene.position_m(n)[2] > self._feet.get(n, np.inf) + 0.012 for n in others)
+        """Whether another object, wedged under this one, has come along."""
+        here = self._scene.position_m(self.goal.item)
+        for name in self._scene.objects:
+            there = self._scene.position_m(name)
+            under = name != self.goal.item and np.linalg.norm((there - here)[:2]) < 0.05
+            if under and there[2] > self._feet.get(name, np.inf) + 0.012:
+                return True
+        return False
 
     def _goal_xy(self) -> np.ndarray:
-        return self._scene.center_m(self.goal.region)[:2] + self._flaws.place_m
+        return self._scene.center_m(self.goal.region)[:2] + self._slot() + self._flaws.place_m
+
+    def _shares(self) -> bool:
+        """Whether several objects are to stand beside one another in the region."""
+        goals = [g for g in self._goals if g.predicate[0] == "on" and g.region == self.goal.region]
+        return len(goals) > 1 and not self._flaws.open_loop
+
+    def _slot(self) -> np.ndarray:
+        """(2,) metres from a region's middle to the object's own place in it: objects stand along x, fingers
+        close along y."""
+        if not self._shares():
+            return np.zeros(2)
+        middle = self._scene.center_m(self.goal.region)[:2]
+        others = [g.item for g in self._goals if g.region == self.goal.region and g.item != self.goal.item]
+        off = [self._scene.position_m(name)[:2] - middle for name in others]
+        there = [float(xy[0]) for xy in off if np.linalg.norm(xy) < 0.12]
+        if not there:
+            return np.array([-_BESIDE_M / 2, 0.0])
+        side = -1.0 if there[0] > 0 else 1.0
+        return np.array([float(np.clip(there[0] + side * _BESIDE_M, -0.065, 0.065)), 0.0])
 
     def _carried_xy(self) -> np.ndarray:
         """What is brought over the goal: the object's body, or the hand of a driver that does not look."""
@@ -280,7 +313,8 @@ class PickPlace(ArmMotion):
             return self._retry()
         hand = self._scene.hand_m
         way = self._goal_xy() - self._carried_xy()
-        if np.linalg.norm(way) < 0.010 or self._steps > 90:
+        turned = not self._shares() or np.linalg.norm(self._rotation_error()) < 0.15
+        if (np.linalg.norm(way) < 0.010 and turned) or self._steps > 90:
             self._enter("lower")
         rise = self._clear() - self._item_bottom()
         if self._flaws.open_loop:

@@ -16,6 +16,8 @@ PICK_AND_PLACE = ("on", "in")
 """Those about where an object is."""
 _ARM_M, _WRIST_M = 0.765, 0.21
 """From the Panda's shoulder to its wrist when it is nearly stretched out; thence to the fingertips."""
+_STRAIGHT_RAD = -0.15
+"""The Panda's elbow; its limit is -0.07."""
 _BOX = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
 _COLLISION_GROUP = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
@@ -80,6 +82,11 @@ class LiberoScene:
         """Height of the hand, metres, at which it meets nothing on its way."""
         return float(self.env.workspace_offset[2]) + 0.27
 
+    @property
+    def stretched(self) -> bool:
+        """Whether the elbow is straight."""
+        return bool(self._data.qpos[self._robot._ref_joint_pos_indexes[3]] > _STRAIGHT_RAD)
+
     def reach_up_m(self, xy_m: np.ndarray) -> float:
         """Greatest height of a hand that points down, metres, at which the arm is not yet stretched out:
         there robosuite's controller lets go of the direction in which it is."""
@@ -102,6 +109,12 @@ class LiberoScene:
             else None
         )
         return None if joint is None or joint.hinged else joint
+
+    def door(self, region: str) -> FixtureJoint | None:
+        """The hinge of the door that a region is behind, if it is behind one."""
+        parent = getattr(self.env.object_sites_dict.get(region), "parent_name", None)
+        names = self.env.get_object(parent).joints if parent is not None and "heating" in region else []
+        return FixtureJoint(self._model, self._data, names[0]) if names else None
 
     @property
     def held(self) -> str:
