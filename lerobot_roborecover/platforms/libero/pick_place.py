@@ -12,7 +12,7 @@ from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
 
 _HOLLOW = ("bowl", "mug")
 """Objects wider than the gripper, to be grasped by the rim."""
-_BESIDE_M = 0.1
+_BESIDE_M = 0.125
 """From the middle of one object to that of another that shares its region."""
 _FINGERS = tuple((along_m, -0.01) for along_m in (-0.05, 0.04, 0.055))
 _PALM = tuple((float(along_m), 0.09) for along_m in np.linspace(-0.1, 0.1, 9))
@@ -295,7 +295,7 @@ class PickPlace(ArmMotion):
         if not there:
             return np.array([-_BESIDE_M / 2, 0.0])
         side = -1.0 if there[0] > 0 else 1.0
-        return np.array([float(np.clip(there[0] + side * _BESIDE_M, -0.065, 0.065)), 0.0])
+        return np.array([float(np.clip(there[0] + side * _BESIDE_M, -0.068, 0.068)), 0.0])
 
     def _carried_xy(self) -> np.ndarray:
         """What is brought over the goal: the object's body, or the hand of a driver that does not look."""
