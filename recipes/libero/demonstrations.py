@@ -30,7 +30,7 @@ from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.platforms.starts import RELEASE_SEED
-from lerobot_roborecover.scenario import Reset, Task
+from lerobot_roborecover.scenario import Pose, Reset, Task
 from lerobot_roborecover.whole import new_folder
 
 FIRST_SEED = 20_000
@@ -54,8 +54,11 @@ class Wanted:
     part: Path
 
 
-def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> None:
+def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> dict[str, np.ndarray]:
     """Puts a task where LIBERO's own placement, not a stored init state, has its objects.
+
+    Returns:
+        `start`, the flattened state, and `fixtures`, (n, 7) poses by sorted name: see `place_again`.
 
     Raises:
         SimulatorError: LIBERO found no placement.
@@ -69,7 +72,21 @@ def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> None:
         state, fixtures = built.env.sim.get_state().flatten(), built.fixtures()
     finally:
         np.random.set_state(drawn)
-    kept, built.init_states = built.init_states, state[None]
+    poses = [[*fixtures[name].position_m, *fixtures[name].quat_xyzw] for name in sorted(fixtures)]
+    placed = {"start": state, "fixtures": np.array(poses).reshape(-1, 7)}
+    place_again(simulator, task, placed)
+    return placed
+
+
+def place_again(simulator: LiberoSimulator, task: Task, placed: Mapping[str, np.ndarray]) -> None:
+    """Puts a task where `place_freshly` put it, and settles."""
+    simulator.reset(task, PLATFORM.first_reset(task))
+    built = simulator._task
+    fixtures = {
+        name: Pose(tuple(pose[:3]), tuple(pose[3:]))
+        for name, pose in zip(sorted(built.fixture_bodies), placed["fixtures"].tolist(), strict=True)
+    }
+    kept, built.init_states = built.init_states, placed["start"][None]
     try:
         simulator.reset(task, Reset(RELEASE_SEED, 0, PLATFORM.settle_steps, fixtures=fixtures))
     finally:
@@ -90,17 +107,19 @@ def demonstration(
         shaken: disturb the executed actions for 20 to 100 steps from a step that is drawn.
     """
     rng = np.random.default_rng(seed)
-    place_freshly(simulator, task, seed)
+    placed = place_freshly(simulator, task, seed)
     first = int(rng.integers(0, 60))
     last = first + int(rng.integers(20, 100)) if shaken else first
-    expert, seen, actions, solved = LiberoExpert(LiberoScene(simulator)), [], [], []
+    expert, seen, actions, executed, solved = LiberoExpert(LiberoScene(simulator)), [], [], [], []
     for t in range(task.horizon):
         seen.append(simulator.observe() | {"environment_state": simulator._view.environment_state()})
         actions.append(expert.act())
-        simulator.step(perturb_translations(actions[-1], rng) if first <= t < last else actions[-1])
+        executed.append(perturb_translations(actions[-1], rng) if first <= t < last else actions[-1])
+        simulator.step(executed[-1])
         solved.append(simulator.succeeded())
         if sum(solved) == _STEPS_AFTER_SUCCESS:
-            return _columns(seen, np.array(actions), np.array(solved))
+            columns = _columns(seen, np.array(actions), np.array(solved))
+            return columns | {"executed": np.array(executed)} | placed
     return None
 
 
@@ -152,11 +171,12 @@ def make_part(wanted: Wanted) -> str:
     simulator.close()
     wanted.part.parent.mkdir(parents=True, exist_ok=True)
     unfinished = wanted.part.with_suffix(".unfinished.npz")
-    names = episodes[0] if episodes else ()
+    names = set(episodes[0] if episodes else ()) - {"start", "fixtures"}
     np.savez(
         unfinished,
         lengths=np.array([len(e["action"]) for e in episodes], dtype=np.int64),
         tried=np.array(tried),
+        **{name: np.array([e[name] for e in episodes]) for name in ("start", "fixtures")},
         **{name: np.concatenate([e[name] for e in episodes]) for name in names},
     )
     unfinished.rename(wanted.part)
