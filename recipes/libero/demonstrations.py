@@ -5,9 +5,11 @@ init states, from which policies are evaluated and scenarios are made, is among 
 clean; in the others the arm is shaken for a while, while the recorded action stays the expert's, so that a
 policy trained on them has seen states beside the expert's path.
 
-    python -m recipes.libero.demonstrations --out DIR --episodes-per-task 40 --workers 2
+    python -m recipes.libero.demonstrations --out DIR --workers 2
+    python -m recipes.libero.demonstrations --out DIR64 --parts DIR.parts --pictures 64 --suites libero_object
 
-Each task's episodes are kept in `DIR.parts` once they are whole; a second call goes on from there.
+Each task's episodes are kept in `DIR.parts` once they are whole; a second call goes on from there. Pictures
+are drawn while the same episodes are replayed.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +42,7 @@ _GIVE_UP_AFTER = 3
 """Rollouts for each episode that is wanted."""
 CAMERAS = ("image", "image2")
 """LeRobot's names of the scene's and the wrist's camera."""
+_REPOSITORY = "roborecover/libero_demonstrations"
 _WIDTHS = {"observation.state": 8, "observation.environment_state": 77, "action": 7, "next.reward": 1}
 
 
@@ -52,6 +55,11 @@ class Wanted:
     pictures: int
     """Side, pixels; 0 for none."""
     part: Path
+
+    @property
+    def drawn(self) -> Path:
+        """The dataset of the task's episodes with pictures."""
+        return self.part.with_name(f"{self.part.stem}.{self.pictures}px")
 
 
 def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> dict[str, np.ndarray]:
@@ -101,7 +109,7 @@ def demonstration(
     """One successful episode of T steps, as arrays by LeRobot's names; None where the expert failed.
 
     Args:
-        simulator: with `obs_type="state"` or with pictures.
+        simulator: with `obs_type="state"`.
         task: what to demonstrate.
         seed: of the placement and of the shaking.
         shaken: disturb the executed actions for 20 to 100 steps from a step that is drawn.
@@ -112,7 +120,7 @@ def demonstration(
     last = first + int(rng.integers(20, 100)) if shaken else first
     expert, seen, actions, executed, solved = LiberoExpert(LiberoScene(simulator)), [], [], [], []
     for t in range(task.horizon):
-        seen.append(simulator.observe() | {"environment_state": simulator._view.environment_state()})
+        seen.append(simulator.observe())
         actions.append(expert.act())
         executed.append(perturb_translations(actions[-1], rng) if first <= t < last else actions[-1])
         simulator.step(executed[-1])
@@ -132,10 +140,6 @@ def _columns(seen: Sequence[Any], actions: np.ndarray, solved: np.ndarray) -> di
     columns = {
         name: observation[name].numpy() for name in ("observation.state", "observation.environment_state")
     }
-    for camera in CAMERAS:
-        if (pictures := observation.get(f"observation.images.{camera}")) is not None:
-            pictures = (pictures * 255).round().byte().permute(0, 2, 3, 1)
-            columns[f"observation.images.{camera}"] = pictures.numpy()
     columns["action"] = np.clip(actions, -1, 1).astype(np.float32)
     columns["next.reward"] = solved[:, None].astype(np.float32)
     return columns
@@ -150,15 +154,7 @@ def _stacked(values: Sequence[Any]) -> Any:
 def make_part(wanted: Wanted) -> str:
     """One task's episodes, in one file; says how it went."""
     began = time.monotonic()
-    options: dict[str, Any] = {"obs_type": "state"}
-    if wanted.pictures:
-        options = {
-            "obs_type": "pixels_agent_pos",
-            "render_quality": "fast",
-            "observation_height": wanted.pictures,
-            "observation_width": wanted.pictures,
-        }
-    simulator = LiberoSimulator(**options)
+    simulator = LiberoSimulator(obs_type="state")
     episodes, tried = [], 0
     while len(episodes) < wanted.episodes and tried < _GIVE_UP_AFTER * wanted.episodes:
         try:
@@ -184,27 +180,64 @@ def make_part(wanted: Wanted) -> str:
     return f"{PLATFORM.short_name(wanted.task)}: {len(episodes)} episodes from {tried} rollouts, {took:.0f} s"
 
 
-def write_dataset(root: Path, parts: Sequence[tuple[Task, Path]]) -> int:
-    """Writes the parts as one LeRobotDataset, whole or not at all; returns its episodes.
+def draw_part(wanted: Wanted) -> str:
+    """A task's episodes once more, with pictures: replayed, and written as a LeRobotDataset of its own."""
+    began = time.monotonic()
+    simulator = LiberoSimulator(
+        obs_type="pixels_agent_pos",
+        render_quality="fast",
+        observation_height=wanted.pictures,
+        observation_width=wanted.pictures,
+    )
+    pictures: dict[str, list[np.ndarray]] = {camera: [] for camera in CAMERAS}
+    with np.load(wanted.part) as part:
+        first = 0
+        for k, length in enumerate(part["lengths"]):
+            placed = {name: part[name][k] for name in ("start", "fixtures")}
+            place_again(simulator, wanted.task, placed)
+            for action in part["executed"][first : first + length]:
+                seen = simulator.observe()["pixels"]
+                for camera in CAMERAS:
+                    pictures[camera].append(seen[camera][::-1, ::-1])  # as LeRobot's processor turns them
+                simulator.step(action)
+            if not simulator.succeeded():
+                raise SimulatorError(f"{wanted.part}: episode {k} does not end as it was recorded")
+            first += length
+    simulator.close()
+    drawn = {f"observation.images.{camera}": np.stack(rows) for camera, rows in pictures.items()}
+    write_dataset(wanted.drawn, [(wanted.task, wanted.part)], drawn)
+    return f"{PLATFORM.short_name(wanted.task)}: {first} pictures twice, {time.monotonic() - began:.0f} s"
+
+
+def write_dataset(
+    root: Path, parts: Sequence[tuple[Task, Path]], pictures: Mapping[str, np.ndarray] | None = None
+) -> int:
+    """Writes parts as one LeRobotDataset, whole or not at all; returns its episodes.
 
     Its features are those of `--env.obs_type=state`, float32, and `next.reward`, 1 once the task is solved;
-    with pictures, `observation.images.image` and `observation.images.image2`, too.
+    with pictures, these in place of the privileged `observation.environment_state`.
+
+    Args:
+        root: must not exist.
+        parts: a task and the file of its episodes, each.
+        pictures: (N, H, W, 3) uint8 by name, of the N frames of the one part that there is then.
     """
     from lerobot.datasets import dataset_writer
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    with np.load(parts[0][1]) as first:
-        sides = {n: first[n].shape[1:] for n in first.files if n.startswith("observation.images.")}
-    if not sides:  # LeRobot looks for pictures to embed row by row, which takes most of the time
-        dataset_writer.embed_images = lambda rows: rows
     features: dict[str, dict[str, Any]] = {
         name: {"dtype": "float32", "shape": (width,), "names": None} for name, width in _WIDTHS.items()
     }
-    for name, shape in sides.items():
-        features[name] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    if pictures:
+        del features["observation.environment_state"]
+        for name, rows in pictures.items():
+            axes = ["height", "width", "channels"]
+            features[name] = {"dtype": "image", "shape": rows.shape[1:], "names": axes}
+    else:  # LeRobot looks for pictures to embed row by row, which takes most of the time
+        dataset_writer.embed_images = lambda rows: rows
     with new_folder(root) as folder:
         dataset = LeRobotDataset.create(
-            repo_id="roborecover/libero_demonstrations",
+            repo_id=_REPOSITORY,
             root=folder,
             fps=int(PLATFORM.control_hz),
             robot_type="panda",
@@ -214,9 +247,9 @@ def write_dataset(root: Path, parts: Sequence[tuple[Task, Path]]) -> int:
         episodes = 0
         for task, path in parts:
             with np.load(path) as part:
-                columns = {name: part[name] for name in features if name in part.files}
+                columns = {name: part[name] for name in features if name in part.files} | dict(pictures or {})
                 ends = np.cumsum(part["lengths"])
-            for begin, end in zip([0, *ends[:-1]], ends, strict=False):
+            for begin, end in zip([0, *ends[:-1]], ends, strict=True):
                 for row in range(begin, end):
                     frame = {name: column[row] for name, column in columns.items()}
                     dataset.add_frame(frame | {"task": task.instruction})
@@ -226,15 +259,23 @@ def write_dataset(root: Path, parts: Sequence[tuple[Task, Path]]) -> int:
     return episodes
 
 
+def _join(root: Path, parts: Sequence[Path]) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    with new_folder(root) as folder:
+        aggregate_datasets([_REPOSITORY] * len(parts), _REPOSITORY, list(parts), folder)
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True, help="folder to write; must not exist")
-    parser.add_argument("--episodes-per-task", type=int, default=40)
+    parser.add_argument("--episodes-per-task", type=int, default=16)
     parser.add_argument("--suites", nargs="+", help="of these alone")
-    parser.add_argument("--pictures", type=int, default=0, help="side of the two pictures; 0: none")
+    parser.add_argument("--pictures", type=int, default=0, help="side of the two cameras' pictures; 0: none")
+    parser.add_argument("--parts", type=Path, help="folder of the finished tasks (OUT.parts)")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     args = parser.parse_args()
     if args.out.exists():
@@ -242,19 +283,28 @@ def main() -> None:
     tasks = [t for t in PLATFORM.tasks() if not args.suites or t.suite in args.suites]
     if not tasks:
         parser.error(f"--suites {args.suites}: there are {sorted({t.suite for t in PLATFORM.tasks()})}")
-    folder = args.out.with_name(f"{args.out.name}.parts")
+    folder = args.parts or args.out.with_name(f"{args.out.name}.parts")
     wanted = [
         Wanted(t, args.episodes_per_task, args.pictures, folder / f"{PLATFORM.short_name(t)}.npz")
         for t in tasks
     ]
-    missing = sorted((w for w in wanted if not w.part.exists()), key=lambda w: -w.task.horizon)
-    with ProcessPoolExecutor(
-        args.workers, multiprocessing.get_context("spawn"), max_tasks_per_child=1
-    ) as pool:
-        for done in as_completed([pool.submit(make_part, w) for w in missing]):
+    _in_processes(make_part, [w for w in wanted if not w.part.exists()], args.workers)
+    solved = [w for w in wanted if len(np.load(w.part)["lengths"])]
+    if args.pictures:
+        _in_processes(draw_part, [w for w in solved if not w.drawn.exists()], args.workers)
+        _join(args.out, [w.drawn for w in solved])
+    else:
+        write_dataset(args.out, [(w.task, w.part) for w in solved])
+    print(f"demonstrations of {len(solved)} tasks in {args.out}", flush=True)
+
+
+def _in_processes(make: Callable[[Wanted], str], wanted: Sequence[Wanted], workers: int) -> None:
+    """The longest first, so that none is left alone at the end."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
+        ordered = sorted(wanted, key=lambda w: -w.task.horizon)
+        for done in as_completed([pool.submit(make, w) for w in ordered]):
             print(done.result(), flush=True)
-    parts = [(w.task, w.part) for w in wanted if len(np.load(w.part)["lengths"])]
-    print(f"{write_dataset(args.out, parts)} episodes in {args.out}", flush=True)
 
 
 if __name__ == "__main__":
