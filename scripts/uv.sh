@@ -14,7 +14,9 @@ if [[ ! -x .tools/bin/uv ]]; then
     done
     "$python" -c 'import ensurepip' >/dev/null 2>&1 || scripts/setup.sh --system python3-venv
     echo "uv: installing it in .tools" >&2
-    "$python" -m venv --clear .tools
+    # What else lies in .tools stays: Mesa's driver, the environments of lint, site and package.
+    rm -rf .tools/bin .tools/lib .tools/lib64 .tools/include .tools/pyvenv.cfg
+    "$python" -m venv .tools
     echo '*' >.tools/.gitignore
     .tools/bin/python -m pip install --quiet --retries 5 uv || .tools/bin/python -m pip install --quiet uv
 fi
