@@ -62,6 +62,16 @@ class Wanted:
         return self.part.with_name(f"{self.part.stem}.{self.pictures}px")
 
 
+def tasks_of(suites: Sequence[str] | None) -> list[Task]:
+    """The suites' tasks; all for None."""
+    return [task for task in PLATFORM.tasks() if not suites or task.suite in suites]
+
+
+def part_of(folder: Path, task: Task) -> Path:
+    """The file of a task's episodes."""
+    return folder / f"{PLATFORM.short_name(task)}.npz"
+
+
 def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> dict[str, np.ndarray]:
     """Puts a task where LIBERO's own placement, not a stored init state, has its objects.
 
@@ -280,14 +290,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"--out={args.out} exists already")
-    tasks = [t for t in PLATFORM.tasks() if not args.suites or t.suite in args.suites]
+    tasks = tasks_of(args.suites)
     if not tasks:
         parser.error(f"--suites {args.suites}: there are {sorted({t.suite for t in PLATFORM.tasks()})}")
     folder = args.parts or args.out.with_name(f"{args.out.name}.parts")
-    wanted = [
-        Wanted(t, args.episodes_per_task, args.pictures, folder / f"{PLATFORM.short_name(t)}.npz")
-        for t in tasks
-    ]
+    wanted = [Wanted(t, args.episodes_per_task, args.pictures, part_of(folder, t)) for t in tasks]
     _in_processes(make_part, [w for w in wanted if not w.part.exists()], args.workers)
     solved = [w for w in wanted if len(np.load(w.part)["lengths"])]
     if args.pictures:

@@ -12,11 +12,7 @@ results, `study/durations.jsonl` says how long everything took.
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +23,7 @@ from lerobot_roborecover.journal import append_records
 from lerobot_roborecover.whole import new_folder
 from recipes.metaworld.dataset import STUDY_TASKS, write_demonstrations
 from recipes.metaworld.initial_success import evaluate, table
+from recipes.training import Training
 
 EPISODES_PER_TASK = 70
 """Every second one is clean, the others are shaken."""
@@ -51,19 +48,9 @@ def episodes(name: str) -> list[int] | None:
     return [task * EPISODES_PER_TASK + n for task in range(len(STUDY_TASKS)) for n in numbers]
 
 
-def training_arguments(name: str, out: Path) -> list[str]:
-    """Arguments of `lerobot-train`: from the start, or from the last checkpoint."""
-    folder = out / "train" / name
-    last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    if last.exists():
-        return [f"--config_path={last}", "--resume=true"]
-    wanted = episodes(name)
-    return [
-        f"--config_path={CONFIGS / name}.yaml",
-        f"--dataset.root={out / 'demonstrations'}",
-        f"--output_dir={folder}",
-        *([] if wanted is None else [f"--dataset.episodes={json.dumps(wanted, separators=(',', ':'))}"]),
-    ]
+def training(name: str, out: Path) -> Training:
+    """A policy's training, in `out/train`."""
+    return Training(CONFIGS / f"{name}.yaml", out / "demonstrations", out / "train" / name, episodes(name))
 
 
 def make_demonstrations(out: Path) -> None:
@@ -85,17 +72,7 @@ def train(name: str, out: Path) -> None:
     if result.exists():
         return
     with _timed(out, name):
-        folder, arguments = out / "train" / name, training_arguments(name, out)
-        if "--resume=true" not in arguments:  # LeRobot refuses the folder of a run without a checkpoint
-            shutil.rmtree(folder, ignore_errors=True)
-        program = [sys.executable, "-m", "recipes.metaworld.frames_in_memory"]
-        subprocess.run([*program, *arguments], check=True)
-    with new_folder(result) as policy:
-        shutil.copytree(
-            folder / "checkpoints" / "last" / "pretrained_model",
-            policy,
-            ignore=shutil.ignore_patterns("train_config.json"),
-        )
+        training(name, out).run(result)
 
 
 def main() -> None:
@@ -112,7 +89,7 @@ def main() -> None:
         parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
     if args.print:
         for name in args.only:
-            print(shlex.join(["lerobot-train", *training_arguments(name, args.out)]))
+            print(shlex.join(["lerobot-train", *training(name, args.out).arguments()]))
         return
     args.out.mkdir(parents=True, exist_ok=True)
     make_demonstrations(args.out)

@@ -57,6 +57,34 @@ def test_batches_from_memory_are_the_dataset_s(demonstrations, episodes, monkeyp
                 assert torch.equal(value, other[key]), key
 
 
+def test_pictures_from_memory_are_the_dataset_s(tmp_path):
+    import torch
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from recipes.metaworld.frames_in_memory import frames_in_memory
+
+    features = {
+        "observation.images.image": {
+            "dtype": "image",
+            "shape": (8, 8, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    made = LeRobotDataset.create("a/b", 20, features, root=tmp_path / "d", robot_type="x", use_videos=False)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        picture = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+        made.add_frame({"observation.images.image": picture, "action": np.zeros(2, np.float32), "task": "do"})
+    made.save_episode()
+    made.finalize()
+    dataset = LeRobotDataset("a/b", root=tmp_path / "d")
+    read = next(iter(torch.utils.data.DataLoader(dataset, batch_size=5)))
+    with frames_in_memory():
+        kept = next(iter(torch.utils.data.DataLoader(dataset, batch_size=5)))
+    assert torch.equal(read["observation.images.image"], kept["observation.images.image"])
+
+
 @pytest.mark.parametrize("name", [pytest.param("diffusion_few", marks=pytest.mark.nightly), "tdmpc"])
 def test_training_from_memory_is_training(name, demonstrations, tmp_path, monkeypatch):
     """The study's configs run in `lerobot-train`, and give the same weights either way."""
@@ -108,6 +136,7 @@ def test_each_policy_learns_from_its_share_of_every_task():
 
 
 def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
+    from recipes import training
     from recipes.metaworld import study_policies
 
     commands = []
@@ -124,7 +153,7 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
         if "--resume=true" not in command:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(study_policies.subprocess, "run", stopped)
+    monkeypatch.setattr(training.subprocess, "run", stopped)
     (tmp_path / "train" / "act").mkdir(parents=True)  # of a run killed before its first checkpoint
     with pytest.raises(KeyboardInterrupt):
         study_policies.train("act", tmp_path)

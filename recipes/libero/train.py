@@ -1,0 +1,107 @@
+"""LIBERO's policies: which demonstrations each learns from, and their training.
+
+    python -m recipes.libero.train --out libero
+    python -m recipes.libero.train --out libero --only act_pixels --device cuda
+    python -m recipes.libero.train --out libero --print
+
+Each is trained by `lerobot-train` from `policies/train/libero/NAME.yaml`, one after the other, on
+demonstrations that are made first. What is finished is skipped, what was interrupted goes on.
+`libero/policies/NAME` are the results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from recipes.libero.demonstrations import part_of, tasks_of
+from recipes.training import Training
+
+EPISODES_PER_TASK = 16
+"""Every second one is clean, the others are shaken."""
+CONFIGS = Path("policies/train/libero")
+POLICIES: dict[str, slice] = {
+    "act": slice(None),
+    "act_clean": slice(None, None, 2),
+    "act_few": slice(4),
+    "diffusion": slice(None),
+    "tdmpc": slice(None),
+    "act_pixels": slice(None),
+}
+"""Which of each task's demonstrations a policy learns from, by its name."""
+WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
+"""Suites of the policies that see pictures."""
+_SIDE = 64
+
+
+def episodes(name: str, parts: Path) -> list[int] | None:
+    """The demonstrations a policy learns from, as `--dataset.episodes` wants them; None: all.
+
+    Args:
+        name: of the policy.
+        parts: folder of the tasks' demonstrations, some of which may be fewer than others.
+    """
+    if POLICIES[name] == slice(None):
+        return None
+    numbers, first = [], 0
+    for task in tasks_of(WITH_EYES.get(name)):
+        count = len(np.load(part_of(parts, task))["lengths"])
+        numbers += [first + n for n in range(count)[POLICIES[name]]]
+        first += count
+    return numbers
+
+
+def training(name: str, out: Path, device: str = "cpu") -> Training:
+    """A policy's training, in `out/train`."""
+    dataset = out / ("pictures" if name in WITH_EYES else "demonstrations")
+    wanted = episodes(name, out / "demonstrations.parts")
+    return Training(CONFIGS / f"{name}.yaml", dataset, out / "train" / name, wanted, device)
+
+
+def make_demonstrations(out: Path, workers: int) -> None:
+    """Writes `out/demonstrations` and `out/pictures`.
+
+    Raises:
+        subprocess.CalledProcessError: one failed; its own output says why.
+    """
+    program = [sys.executable, "-m", "recipes.libero.demonstrations", f"--workers={workers}"]
+    given = [f"--episodes-per-task={EPISODES_PER_TASK}", f"--parts={out / 'demonstrations.parts'}"]
+    suites = sorted({suite for found in WITH_EYES.values() for suite in found})
+    for name, more in {
+        "demonstrations": [],
+        "pictures": [f"--pictures={_SIDE}", "--suites", *suites],
+    }.items():
+        if not (out / name).exists():
+            subprocess.run([*program, *given, f"--out={out / name}", *more], check=True)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder to work in")
+    parser.add_argument("--only", nargs="+", choices=POLICIES, default=list(POLICIES), metavar="NAME")
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda")
+    parser.add_argument("--workers", type=int, default=2, help="processes that make demonstrations")
+    parser.add_argument("--print", action="store_true", help="print the training commands and train nothing")
+    args = parser.parse_args()
+    if not CONFIGS.is_dir():
+        parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
+    args.out.mkdir(parents=True, exist_ok=True)
+    make_demonstrations(args.out, args.workers)
+    for name in args.only:
+        wanted, result = training(name, args.out, args.device), args.out / "policies" / name
+        if args.print:
+            print(shlex.join(["lerobot-train", *wanted.arguments()]))
+        elif not result.exists():
+            wanted.run(result)
+
+
+if __name__ == "__main__":
+    main()

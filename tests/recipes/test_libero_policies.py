@@ -1,0 +1,64 @@
+"""LIBERO's demonstrations and the policies that learn from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+pytestmark = [pytest.mark.libero, pytest.mark.lerobot]
+
+
+def test_every_config_is_a_policy_s():
+    import draccus
+    from lerobot.configs.train import TrainPipelineConfig
+
+    import lerobot_roborecover.plugin  # noqa: F401
+    from recipes.libero.train import POLICIES
+
+    kinds = {}
+    for file in (ROOT / "policies" / "train" / "libero").glob("*.yaml"):
+        config = draccus.parse(TrainPipelineConfig, file, args=[])
+        assert config.scheduler.num_decay_steps == config.steps, file.name
+        kinds[file.stem] = config.policy.type
+    assert sorted(kinds) == sorted(POLICIES)
+    assert set(kinds.values()) == {"act", "diffusion", "tdmpc"}
+
+
+def test_a_policy_learns_from_its_share_of_every_task_whatever_there_is_of_it(tmp_path):
+    from recipes.libero.demonstrations import part_of, tasks_of
+    from recipes.libero.train import episodes
+
+    counts = [0, 16, 3] + [16] * 37
+    for task, count in zip(tasks_of(None), counts, strict=True):
+        np.savez(part_of(tmp_path, task), lengths=np.full(count, 9))
+    assert episodes("act", tmp_path) is None
+    assert episodes("act_few", tmp_path)[:8] == [0, 1, 2, 3, 16, 17, 18, 19]
+    assert episodes("act_clean", tmp_path)[:11] == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 19]
+
+
+@pytest.mark.nightly
+@pytest.mark.render
+def test_an_episode_is_drawn_by_replaying_it(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from recipes.libero import demonstrations as made
+
+    task = made.tasks_of(["libero_goal"])[7]  # the knob: short
+    wanted = made.Wanted(task, 2, 32, made.part_of(tmp_path / "parts", task))
+    assert "2 episodes" in made.make_part(wanted)
+    with np.load(wanted.part) as part:
+        states, lengths = part["observation.environment_state"], part["lengths"]
+        assert not np.array_equal(part["start"][0], part["start"][1])
+    made.draw_part(wanted)  # raises where the replay does not end in success
+    pictures = LeRobotDataset("a/b", root=wanted.drawn)
+    assert len(pictures) == lengths.sum() == len(states)
+    assert pictures[0]["observation.images.image"].shape == (3, 32, 32)
+    assert "observation.environment_state" not in pictures.features
+    made.write_dataset(tmp_path / "numbers", [(task, wanted.part)])
+    numbers = LeRobotDataset("a/b", root=tmp_path / "numbers")
+    assert np.allclose(numbers[5]["observation.environment_state"], states[5])
+    assert np.allclose(numbers[5]["action"], pictures[5]["action"])
