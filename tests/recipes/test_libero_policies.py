@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,43 @@ def test_a_policy_learns_from_its_share_of_every_task_whatever_there_is_of_it(tm
     assert episodes("act", tmp_path) is None
     assert episodes("act_few", tmp_path)[:8] == [0, 1, 2, 3, 16, 17, 18, 19]
     assert episodes("act_clean", tmp_path)[:11] == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 19]
+
+
+SHIPPED = ROOT / "policies" / "libero"
+
+
+def test_the_policies_in_the_clone_are_small_and_say_what_they_need():
+    from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
+    from recipes.libero.train import POLICIES
+
+    names = {path.name for path in SHIPPED.iterdir()}
+    assert {"act", "diffusion"} < names <= set(POLICIES)
+    for name in names:
+        assert (SHIPPED / name / "model.safetensors").stat().st_size < 10e6, name
+        config = json.loads((SHIPPED / name / "config.json").read_text())
+        assert config["device"] == "cpu"
+        shapes = {key: feature["shape"] for key, feature in config["input_features"].items()}
+        assert shapes == {
+            "observation.state": [8], "observation.environment_state": [ENVIRONMENT_STATE_DIM]
+        }  # fmt: skip
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["act", "act_few", "diffusion"])
+def test_a_policy_of_the_clone_solves_starts(name, tmp_path):
+    """Two of three easy ones: another processor may round a rollout the other way."""
+    from lerobot_roborecover.cli.main import main
+    from recipes.libero.initial_success import count, table
+
+    given = ["--env.type=roborecover_libero", "--env.obs_type=state", f"--policy.path={SHIPPED / name}"]
+    starts = ["--task=libero_object/*butter*", "--task=libero_object/*milk*", "--task=libero_object/*salad*"]
+    out = ["--init-states=0", "--frames=none", f"--name={name}", f"--out={tmp_path / name}"]
+    main(["collect", *given, *starts, *out])  # where all are solved, it has nothing to write
+    counts = count([tmp_path / f"{name}.work"])
+    solved, tried = counts[name]["libero_object"]
+    assert tried == 3
+    assert solved >= 2
+    assert f"| libero_object | {solved}/3 |" in table(counts)
 
 
 @pytest.mark.nightly

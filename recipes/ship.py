@@ -1,6 +1,6 @@
-"""Copies a trained policy as it ships: weights in half precision, without the training's own settings.
+"""Copies a trained policy as it ships: half precision, for a CPU, without the training's own settings.
 
-    python -m recipes.pusht.ship CHECKPOINT lerobot_roborecover/data/pusht_policies/NAME
+    python -m recipes.ship CHECKPOINT lerobot_roborecover/data/pusht_policies/NAME
 
 LeRobot loads them into float32 again.
 """
@@ -23,6 +23,8 @@ def ship(checkpoint: Path, out: Path) -> None:
             weights = load_file(file)
             half = {k: v.half() if v.dtype == torch.float32 else v for k, v in weights.items()}
             save_file(half, out / file.name, metadata={"format": "pt"})
+        elif file.suffix == ".json" and file.name != "train_config.json":
+            (out / file.name).write_text(file.read_text().replace('"device": "cuda"', '"device": "cpu"'))
         elif file.name != "train_config.json":
             shutil.copyfile(file, out / file.name)
 
