@@ -159,6 +159,7 @@ def test_a_dataset_without_people_says_nothing(tmp_path):
         find_people(tmp_path / "set")
 
 
+@pytest.mark.slow
 def test_publish_says_it_before_anything_is_uploaded_and_leaves_it_out_when_asked(hub, client, annotated):
     root = annotated[1]
     shown = client.publish(root, "--dry-run").stdout

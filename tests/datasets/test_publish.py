@@ -45,6 +45,7 @@ def test_a_private_repository_is_made_private(hub, client, local, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_published_version_stays_unless_forced(hub, client, local, tmp_path):
     first = commit_of(client.publish(local))
     again = client.publish(local)
@@ -133,6 +134,7 @@ def test_what_the_hub_refuses_is_one_clear_line_and_no_version(hub, client, loca
     assert "roborecover-1.0.0" not in (hub.repos[REPO].refs if REPO in hub.repos else {})
 
 
+@pytest.mark.slow
 def test_a_commit_by_somebody_else_in_between_is_not_overwritten(hub, client, local, tmp_path):
     client.publish(local)
     script = CLI.replace(
@@ -190,6 +192,7 @@ def add_episodes(local, count: int, size: int = 1) -> None:
         pq.write_table(table, local / "data" / "chunk-000" / f"file-{i:03d}.parquet")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "pattern"), [("PUT", "/lfs/"), ("POST", "/commit/"), ("POST", "/tag/")])
 def test_a_publication_that_is_killed_shows_nothing_half_and_goes_on(hub, client, local, method, pattern):
     add_episodes(local, 2)

@@ -63,6 +63,7 @@ def test_a_pull_refuses_what_no_dataset_holds_and_writes_nothing(hub, client, lo
     assert files_of(local) == before
 
 
+@pytest.mark.slow
 def test_a_manifest_that_counts_otherwise_and_a_bomb_are_refused(hub, client, local, tmp_path):
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -138,6 +138,7 @@ def test_the_policy_rounds_as_on_other_machines(settings, monkeypatch):
         assert {k: seen[k] for k in policy_kernels()} == policy_kernels()
 
 
+@pytest.mark.slow
 def test_both_starts_are_run_and_reported(settings, capsys):
     page = run_demo(settings())
     out = capsys.readouterr().out
@@ -152,6 +153,7 @@ def test_both_starts_are_run_and_reported(settings, capsys):
     assert {r.start for r in rows} == {"recovery", "initial"}
 
 
+@pytest.mark.slow
 def test_a_finished_demo_runs_nothing_again(settings):
     run_demo(settings())
     before = settings().trial_log.read_bytes()
@@ -162,6 +164,7 @@ def test_a_finished_demo_runs_nothing_again(settings):
     assert len(read_trial_log(settings().trial_log)) == 24
 
 
+@pytest.mark.slow
 def test_a_failed_run_shows_the_end_of_its_output_and_goes_on_when_rerun(settings, capsys):
     with pytest.raises(
         DemoError, match=r"(?s)status 3 after 3 of 8 trials.*the stand-in gives up.*same command"

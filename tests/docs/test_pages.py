@@ -60,6 +60,7 @@ def test_a_command_and_its_options_exist(words):
             assert option in known or nested, f"{option}: no option of roborecover {command}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON, ids=named)
 def test_python_is_python_and_its_imports_are_there(block):
     tree = ast.parse(block.code, block.name)

@@ -52,6 +52,7 @@ def _lines(log: Path) -> int:
 STORM = pytest.mark.nightly
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "count", "least"),
     [

@@ -194,6 +194,7 @@ def test_non_finite_and_misshapen_actions_become_policy_errors(dataset, tmp_path
     assert all(r.outcome == "policy_error" and "(2,)" in r.reason for r in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "outcome", "words"),
     [

@@ -232,6 +232,7 @@ def test_a_pair_of_get_and_set_is_the_state(toys):
     assert simulator.state_sha256() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lerobot_pusht", "lerobot_aloha"])
 def test_the_contract_holds(name):
     platform = platform_named(name)

@@ -100,6 +100,7 @@ def test_noise_belongs_to_the_trial_not_to_the_batch(dataset, tmp_path):
     assert len({sha for _, _, sha, _ in one.values()}) == len(one)
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(stops=st.lists(st.integers(0, 200), max_size=3))
 def test_stopped_and_resumed(dataset, reference, tmp_path_factory, stops):
@@ -147,6 +148,7 @@ def test_a_scenario_that_keeps_breaking_is_parked(tmp_path):
     assert Counter(r.reason.startswith("not tried") for r in rows)[True] >= 2
 
 
+@pytest.mark.slow
 def test_a_hung_simulator_becomes_a_timeout(tmp_path):
     root = write_scenarios(
         tmp_path / "set", [fake_scenario(0), fake_scenario(1, name="hangs", suite="faults")]
