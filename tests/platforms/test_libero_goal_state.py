@@ -151,3 +151,19 @@ def test_the_page_has_the_table():
     assert [name for _, name in rows] == [name for name, _ in ENVIRONMENT_STATE]
     ends = np.cumsum([width for _, width in ENVIRONMENT_STATE])
     assert [int(numbers.split("-")[-1]) for numbers, _ in rows] == [end - 1 for end in ends]
+
+
+@pytest.mark.lerobot
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--render_quality=fast"], True),
+        ([], False),
+        (["--render_quality=fast", "--obs_type=state"], False),
+    ],
+)
+def test_trials_say_which_fast_pictures_they_saw(options, said):
+    from lerobot_roborecover.curation.policy_trials import env_config
+
+    decisive = env_config("libero", "none", options).run_spec().decisive
+    assert ("fast_pictures" in decisive) == said

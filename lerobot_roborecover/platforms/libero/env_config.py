@@ -23,6 +23,10 @@ from lerobot_roborecover.platforms.base import (
 from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 
+_FAST_PICTURES = 2
+"""Of how `fast` draws (`fast.py`, `decimation.py`); another number where pictures change, so that no log
+mixes them."""
+
 
 @dataclass
 class LiberoConfig(LiberoEnv, FilmedEnvConfig):
@@ -86,6 +90,8 @@ class LiberoConfig(LiberoEnv, FilmedEnvConfig):
         assets = find_assets(self.assets_dir or None)
         options = {**self.gym_kwargs, "assets_dir": str(assets)}
         decisive = {k: v for k, v in options.items() if k != "assets_dir"}
+        if self.render_quality == "fast" and self.obs_type != "state":
+            decisive["fast_pictures"] = _FAST_PICTURES
         picture = _upright
         if self.obs_type == "state":
             picture = None if self.videos else no_video
