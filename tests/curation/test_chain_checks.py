@@ -96,6 +96,8 @@ def test_programs_annotate_without_frames(problems):
     problems.good["annotate"] = {**problems.good.get("annotate", {}), "automatic": True}
     parts = problems.good["collect"].items()
     problems.good["collect"] = {name: {**part, "frames": "none"} for name, part in parts}
+    assert any("no frames to compare replays with" in p for p in problems())
+    problems.good["validate"] = {**problems.good.get("validate", {}), "no_frames": True}
     assert not [p for p in problems() if "frame" in p]
     assert any("frame sizes differ" in p for p in problems("collect.biased.frames", 32))
 

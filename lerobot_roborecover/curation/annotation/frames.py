@@ -68,7 +68,10 @@ class Videos:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
             raise ScenarioError(f"{path} is not LeRobot's ({err!r:.200}); fetch the dataset again") from None
         if not self.cameras and needed:
-            raise ScenarioError(f"{root} has no video; annotators need something to look at. Record one")
+            raise ScenarioError(
+                f"{root} has no video. Record one (collect --frames SIDE), or go without: annotate "
+                "--automatic, validate --no-frames (in a build: `no_frames: true`)"
+            )
         for camera in self.cameras:
             if "/" in camera or ".." in camera:
                 raise ScenarioError(f"{path}: camera {camera!r:.80} is not a plain name")

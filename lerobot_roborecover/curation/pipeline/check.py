@@ -145,6 +145,9 @@ def _check_dataset(dataset: Path, platform: str) -> None:
         raise ScenarioError(f"{dataset} is of {found.platform}, this build of {platform}")
 
 
+_NO_VIDEO = (0, 0)
+
+
 def _check_sizes(config: ChainConfig) -> None:
     """Candidates are joined without encoding anything again, so that all pictures are of one size."""
     sizes: dict[str, set[tuple[int, int]]] = {}
@@ -154,7 +157,7 @@ def _check_sizes(config: ChainConfig) -> None:
         elif str(part.frames or _SIZE) == "none":
             if not config.annotate.automatic:  # programs read numbers
                 raise OptionError(f"collect.{name}.frames: none; annotators need something to look at")
-            sizes[name] = {(0, 0)}
+            sizes[name] = {_NO_VIDEO}
         elif platform_named(config.platform).sizes_pictures and str(part.frames or _SIZE).isdigit():
             side = int(part.frames or _SIZE)
             if side % 2:
@@ -165,13 +168,19 @@ def _check_sizes(config: ChainConfig) -> None:
             f"{name} {' and '.join(f'{w} x {h}' for h, w in sorted(found))}" for name, found in sizes.items()
         )
         raise OptionError(f"frame sizes differ ({said}), and candidates of one build share one; set frames")
+    blind = next((name for name, found in sizes.items() if found == {_NO_VIDEO}), None)
+    if blind is not None and not config.validate.no_frames:
+        raise OptionError(
+            f"collect.{blind} has no frames to compare replays with; film it (frames: SIDE), or set "
+            "validate.no_frames: true"
+        )
 
 
 def _filmed(dataset: Path) -> set[tuple[int, int]]:
-    """Height and width of a dataset's videos; nothing where that cannot be told."""
+    """Height and width of a dataset's videos, or `_NO_VIDEO`; nothing where that cannot be told."""
     try:
         features = json.loads((dataset / "meta" / "info.json").read_bytes())["features"].values()
-        return {tuple(f["shape"][:2]) for f in features if f["dtype"] == "video"}
+        return {tuple(f["shape"][:2]) for f in features if f["dtype"] == "video"} or {_NO_VIDEO}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()  # reading the dataset says what is wrong with it
 
