@@ -22,6 +22,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -243,9 +244,9 @@ def write_dataset(
         for name, rows in pictures.items():
             axes = ["height", "width", "channels"]
             features[name] = {"dtype": "image", "shape": rows.shape[1:], "names": axes}
-    else:  # LeRobot looks for pictures to embed row by row, which takes most of the time
-        dataset_writer.embed_images = lambda rows: rows
-    with new_folder(root) as folder:
+    # LeRobot looks for pictures to embed row by row, which takes most of the time where there are none.
+    embed = dataset_writer.embed_images if pictures else lambda rows: rows
+    with new_folder(root) as folder, patch.object(dataset_writer, "embed_images", embed):
         dataset = LeRobotDataset.create(
             repo_id=_REPOSITORY,
             root=folder,

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.platforms.libero import PLATFORM
-from lerobot_roborecover.platforms.libero.assets import ASSETS_VARIABLE
-from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.platforms.starts import Starts
 from recipes.libero.expert_success import solve, spread_inits, table, tasks_named
 
@@ -22,18 +20,6 @@ KINDS = {
     "goal:7": "a knob is turned",
     "goal:8": "a bowl is put down beside a cabinet",
 }
-
-
-@pytest.fixture(scope="module")
-def simulator():
-    from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
-
-    try:
-        made = LiberoSimulator(obs_type="state")
-    except SimulatorError:
-        pytest.skip(f"no LIBERO assets; set {ASSETS_VARIABLE}")
-    yield made
-    made.close()
 
 
 def start(number: str, init: int):

@@ -11,9 +11,7 @@ import pytest
 import lerobot_roborecover
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms.libero import PLATFORM
-from lerobot_roborecover.platforms.libero.assets import ASSETS_VARIABLE
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS
-from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import Reset, Scenario, Source
 from lerobot_roborecover.snapshots import SnapshotCache
@@ -54,18 +52,6 @@ def test_set_is_what_it_promises(scenarios):
 def test_perturbed_prefixes_are_not_clipped(scenarios):
     perturbed = [s for s in scenarios if s.source is Source.PERTURBED]
     assert all(np.abs(s.prefix[:, :3]).max() > 1.0 for s in perturbed)
-
-
-@pytest.fixture(scope="module")
-def simulator():
-    from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
-
-    try:
-        made = LiberoSimulator(obs_type="state")
-    except SimulatorError:
-        pytest.skip(f"no LIBERO assets; set {ASSETS_VARIABLE}")
-    yield made
-    made.close()
 
 
 @pytest.mark.nightly

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_roborecover.platforms.libero.motion import CLOSED, OPEN, ArmMotion, Flaws
+from lerobot_roborecover.platforms.libero.motion import CLOSED, OPEN, ClearMotion, Flaws
 from lerobot_roborecover.platforms.libero.scene import FixtureJoint, Goal, LiberoScene
 
 _DOWN, _UP = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
@@ -14,7 +16,7 @@ _PULL_TILT_RAD, _PUSH_TILT_RAD = 1.25, 0.6
 hand that hangs down would meet those above."""
 
 
-class JointMotion(ArmMotion):
+class JointMotion(ClearMotion, ABC):
     """A driver of one joint: approaches from `_standoff_m`, then works from `_contact_m`.
 
     Args:
@@ -27,8 +29,7 @@ class JointMotion(ArmMotion):
     """Gripper on the way."""
 
     def __init__(self, scene: LiberoScene, goal: Goal, flaws: Flaws | None = None):
-        super().__init__(scene, flaws)
-        self.goal = goal
+        super().__init__(scene, goal, flaws)
         self._aim = np.array(self._flaws.aim_m) + np.array([0.0, 0.0, -self._flaws.carry_m / 2])
         self._start()
 
@@ -40,23 +41,17 @@ class JointMotion(ArmMotion):
         self._plan()
         self._enter("release" if self._scene.held else "rise")
 
+    @abstractmethod
     def _plan(self) -> None:
         """Sets `_grip_rotation`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _contact(self) -> np.ndarray:
         """(3,) metres: where the hand begins to work."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _standoff(self) -> np.ndarray:
         """(3,) metres: where the hand waits before that."""
-        raise NotImplementedError
-
-    def _release(self) -> np.ndarray:
-        """Lets go of whatever is in the hand, then backs off."""
-        if self._steps > 14:
-            self._enter("rise")
-        return self._up(OPEN, 0.0 if self._steps < 6 else 0.06)
 
     def _rise(self) -> np.ndarray:
         """Up from among the objects."""
@@ -92,9 +87,9 @@ class JointMotion(ArmMotion):
             self._enter("move")
         return self._toward(self._contact(), CLOSED, gain=1.0)
 
+    @abstractmethod
     def _move(self) -> np.ndarray:
         """Moves the joint."""
-        raise NotImplementedError
 
     def _ends(self, lost: bool, limit: int) -> bool:
         """Whether the work ends here: reached, out of hand, let go too early, or taking too long."""
@@ -107,19 +102,10 @@ class JointMotion(ArmMotion):
     def _leave(self) -> np.ndarray:
         """Lets go and backs off."""
         if self._steps > 16:
-            if self._flaws.open_loop:
-                self._enter("rest")
-            elif self._scene.reached(self.goal):
-                self.done = True
-            else:
-                self._tries += 1
-                self._start()
+            self._end_or(self._start)
         if self._steps < 5:
             return self._toward(self._scene.hand_m, OPEN, turn=False)
         return self._toward(self._scene.hand_m - 0.05 * self._scene.hand_rotation[:, 2], OPEN, turn=False)
-
-    def _rest(self) -> np.ndarray:
-        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
 
 
 class DrawerPull(JointMotion):

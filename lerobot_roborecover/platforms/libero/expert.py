@@ -16,7 +16,7 @@ from lerobot_roborecover.platforms.libero.articulated import (
     JointMotion,
     KnobTurn,
 )
-from lerobot_roborecover.platforms.libero.goals import PREDICATES
+from lerobot_roborecover.platforms.libero.goals import turn_of
 from lerobot_roborecover.platforms.libero.insert import PlaceInside, on_sill
 from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
 from lerobot_roborecover.platforms.libero.pick_place import PickPlace
@@ -39,7 +39,7 @@ class LiberoExpert:
 
     def __init__(self, scene: LiberoScene, flaws: Flaws | None = None):
         self._scene, self._flaws = scene, flaws or Flaws()
-        self._goals = sorted(scene.goals, key=lambda goal: PREDICATES[goal.predicate[0]])
+        self._goals = sorted(scene.goals, key=lambda goal: turn_of(goal.predicate))
         self._motion = self._next()
 
     def act(self) -> np.ndarray:

@@ -10,10 +10,15 @@ PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2
 """Predicates of a goal that the drivers know, and when their turn comes."""
 
 
+def turn_of(predicate: Sequence[str]) -> int:
+    """When a predicate's turn comes, the lowest first."""
+    return PREDICATES.get(predicate[0], 1)
+
+
 def workable_order(predicates: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
     """LIBERO's order, but what is opened or turned on comes first, and what is closed comes last.
 
     Args:
         predicates: each with its arguments, e.g. `("in", "mug_1", "microwave_1_heating_region")`.
     """
-    return [tuple(p) for p in sorted(predicates, key=lambda p: PREDICATES.get(p[0], 1))]
+    return [tuple(p) for p in sorted(predicates, key=turn_of)]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_roborecover.platforms.libero.scene import LiberoScene
+from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
 
 OPEN, CLOSED = -1.0, 1.0
 """Commands of the gripper."""
@@ -64,6 +65,10 @@ class ArmMotion:
     def _enter(self, phase: str) -> None:
         self.phase, self._steps = phase, 0
 
+    def _rest(self) -> np.ndarray:
+        """Waits, as a driver that believes it is done."""
+        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
+
     def _rotation_error(self) -> np.ndarray:
         return Rotation.from_matrix(self._grip_rotation @ self._scene.hand_rotation.T).as_rotvec()
 
@@ -93,3 +98,34 @@ class ArmMotion:
         if closing @ self._scene.hand_rotation[:, 0] < 0:
             closing = -closing
         return np.stack([closing, np.cross(pointing, closing), pointing], axis=1)
+
+
+class ClearMotion(ArmMotion):
+    """A driver that begins with an empty hand above everything, and lets go at the end.
+
+    Args:
+        scene: of the simulator's current reset.
+        goal: to be reached.
+        flaws: errors to make.
+    """
+
+    def __init__(self, scene: LiberoScene, goal: Goal, flaws: Flaws | None = None):
+        super().__init__(scene, flaws)
+        self.goal = goal
+
+    def _release(self) -> np.ndarray:
+        """Lets go of whatever is in the hand, then backs off."""
+        if self._steps > 14:
+            self._enter("rise")
+        return self._up(OPEN, 0.0 if self._steps < 6 else 0.06)
+
+    def _end_or(self, again: Callable[[], None]) -> None:
+        """Rests after the one attempt of a driver that does not look, ends where the goal is reached, or
+        tries again."""
+        if self._flaws.open_loop:
+            self._enter("rest")
+        elif self._scene.reached(self.goal):
+            self.done = True
+        else:
+            self._tries += 1
+            again()

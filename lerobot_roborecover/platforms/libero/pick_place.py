@@ -351,7 +351,3 @@ class PickPlace(ArmMotion):
                 self._tries += 1
                 self._choose()
         return self._up(OPEN, 0.06)
-
-    def _rest(self) -> np.ndarray:
-        """Waits, as a driver that believes it is done."""
-        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_roborecover.platforms.libero.motion import CLOSED, OPEN, ArmMotion, Flaws
+from lerobot_roborecover.platforms.libero.motion import CLOSED, OPEN, ClearMotion, Flaws
 from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class RimSlide(ArmMotion):
+class RimSlide(ClearMotion):
     """Takes the rim on the side of the goal between the fingers, and slides it there.
 
     Args:
@@ -20,8 +20,7 @@ class RimSlide(ArmMotion):
     """
 
     def __init__(self, scene: LiberoScene, goal: Goal, flaws: Flaws | None = None):
-        super().__init__(scene, flaws)
-        self.goal = goal
+        super().__init__(scene, goal, flaws)
         self._plan()
         self._enter("release" if scene.held else "rise")
 
@@ -44,12 +43,6 @@ class RimSlide(ArmMotion):
         radius = (high - low)[:2].min() / 2 - 0.004 * (1 + self._tries % 3)
         point = (low + high)[:2] / 2 + radius * self._ahead
         return np.array([*point, low[2] + 0.014 - self._flaws.carry_m / 4]) + self._flaws.aim_m
-
-    def _release(self) -> np.ndarray:
-        """Lets go of whatever is in the hand, then backs off."""
-        if self._steps > 14:
-            self._enter("rise")
-        return self._up(OPEN, 0.0 if self._steps < 6 else 0.06)
 
     def _rise(self) -> np.ndarray:
         rise = self._scene.clear_m - 0.1 - self._scene.hand_m[2]
@@ -86,15 +79,9 @@ class RimSlide(ArmMotion):
 
     def _leave(self) -> np.ndarray:
         if self._steps > 18:
-            if self._flaws.open_loop:
-                self._enter("rest")
-            elif self._scene.reached(self.goal):
-                self.done = True
-            else:
-                self._tries += 1
-                self._plan()
-                self._enter("over")
+            self._end_or(self._again)
         return self._up(OPEN, 0.0 if self._steps < 6 else 0.06)
 
-    def _rest(self) -> np.ndarray:
-        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
+    def _again(self) -> None:
+        self._plan()
+        self._enter("over")
