@@ -11,8 +11,6 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.whole import write_whole
 
-_EXTRAS = {"libero": "libero", "robotwin": "robotwin", "lerobot": "gym"}
-
 
 def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | None = None) -> list[Path]:
     """Writes the repository's folder; what is in it of other names stays.
@@ -42,15 +40,14 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         "split": offer.split,
         "total": len(scenarios),
     }
-    env_name = platform.env_name or platform.name
     card = render_card(
         "envhub.md.j2",
         metadata={"tags": ["LeRobot", "RoboRecover", "robotics", "envhub"], "library_name": "lerobot"},
         title=repo_id.split("/")[-1],
         repo_id=repo_id,
         on_hub=bool(HUB_ID.fullmatch(offer.scenarios)),
-        extra=_EXTRAS.get(env_name, ""),
-        env_name=env_name,
+        install=platform.install_command,
+        env_name=platform.env_name or platform.name,
         **values,
     )
     texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}

@@ -8,6 +8,7 @@ import runpy
 import pytest
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.platforms import platform_named
 from tests.support.factories import fake_dataset
 from tests.support.hub_client import REPO, commit_of
 from tests.support.hub_server import Repo
@@ -48,6 +49,7 @@ def test_lerobot_makes_the_environment_of_a_repository_on_the_hub(hub, client, t
     assert f"hf upload {ENV_REPO} {out}" in made.stdout
     text = (out / "env.py").read_text()
     assert commit in text, "the commit that was read, whatever main is later"
+    assert f"\n{platform_named('fake').install_command}\n" in (out / "README.md").read_text()
     hub.repos[ENV_REPO] = repo = Repo()
     sha = repo.commit({path.name: path.read_bytes() for path in out.iterdir()})
     done = client.run(USE, f"{ENV_REPO}@{sha}", tmp_path / "log.jsonl", "")
