@@ -6,10 +6,10 @@ be replayed: for the monitor's frames, or as a demonstration. A rerun goes on wh
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +17,9 @@ import numpy as np
 
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial_log import Finished, RowLog, TrialRow, read_trial_log, trial_key
+from lerobot_roborecover.env.trial import Trial, actions_digest
+from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log, trial_key
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.local import LocalEngine
@@ -39,84 +39,6 @@ class PolicyTrial:
     row: TrialRow
     actions: np.ndarray
     """(steps, A), of the type that the policy gave: replaying them is exact only in that type."""
-
-
-class RecordingHost:
-    """A policy host that remembers the actions of every trial under way.
-
-    Args:
-        host: who acts.
-    """
-
-    def __init__(self, host: Host):
-        self._host = host
-        self.max_batch, self.batched = host.max_batch, host.batched
-        self._chunks: dict[int, list[np.ndarray]] = {}
-
-    def noise(self, seed: int | None) -> str:
-        """As the host's."""
-        return self._host.noise(seed)
-
-    def start(self, seed: int | None) -> tuple[int, Any]:
-        """Fresh history; `seed` names the trial."""
-        if seed is None:
-            raise ValueError("recording needs a run with a seed: it tells trials apart")
-        self._chunks[seed] = []
-        return seed, self._host.start(seed)
-
-    def finish(self, history: tuple[int, Any]) -> None:
-        """Forgets the trial."""
-        self._chunks.pop(history[0], None)
-        self._host.finish(history[1])
-
-    def act(
-        self, observations: Sequence, instructions: Sequence[str], histories: Sequence[tuple[int, Any]]
-    ) -> list[Chunk | PolicyError]:
-        """The host's chunks."""
-        chunks = self._host.act(observations, instructions, [h for _, h in histories])
-        for (seed, _), chunk in zip(histories, chunks, strict=True):
-            if not isinstance(chunk, PolicyError):
-                self._chunks[seed].append(np.array(chunk))
-        return chunks
-
-    def executed(self, row: TrialRow) -> np.ndarray | None:
-        """(steps, A) actions of a trial that has just ended; None where there were none.
-
-        Raises:
-            ScenarioError: they are not those whose hash the row holds.
-        """
-        known = row.steps and row.trial_seed is not None
-        chunks = self._chunks.get(row.trial_seed) if known else None
-        if not chunks:
-            return None
-        actions = np.concatenate(chunks)[: row.steps]
-        if actions_digest(actions) != row.actions_sha256:
-            raise ScenarioError(
-                f"trial {row.trial} of {row.scenario_id}: the recorded actions are not the executed ones"
-            )
-        return actions
-
-
-class _KeepingLog:
-    """A trial log that puts the actions on disk before the row, so that no row is without them."""
-
-    def __init__(self, log: RowLog, host: RecordingHost, folder: Path):
-        self._log, self._host, self._folder = log, host, folder
-        self.path = log.path
-
-    @property
-    def rows(self) -> list[TrialRow]:
-        return self._log.rows
-
-    def find(self, key: tuple) -> Finished | None:
-        return self._log.find(key)
-
-    def append(self, row: TrialRow) -> None:
-        actions = self._host.executed(row)
-        if actions is not None:
-            with new_file(actions_path(self._folder, row)) as path, open(path, "wb") as file:
-                np.save(file, actions, allow_pickle=False)
-        self._log.append(row)
 
 
 def run_trials(
@@ -169,10 +91,8 @@ def run_trials(
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
-            host = RecordingHost(
-                load.load_host(load.HostSpec(config, env, rename_map or {}, seed, max_batch))
-            )
-            run.log = _KeepingLog(log, host, folder / ACTIONS_FOLDER)
+            host = load.load_host(load.HostSpec(config, env, rename_map or {}, seed, max_batch))
+            run.keep = partial(_keep_actions, folder / ACTIONS_FOLDER)
             count = [len(units) - len(todo)]
 
             def told(row: TrialRow) -> None:
@@ -228,12 +148,18 @@ def flat_options(nested: Mapping[str, Any], head: str = "") -> list[tuple[str, A
     return found
 
 
-def actions_digest(actions: np.ndarray) -> str:
-    """What a trial row calls `actions_sha256`."""
-    digest = hashlib.sha256()
-    for action in actions:
-        digest.update(np.ascontiguousarray(action).tobytes())
-    return digest.hexdigest()
+def _keep_actions(folder: Path, trial: Trial, row: TrialRow) -> None:
+    if not row.steps:
+        return
+    actions = trial.actions
+    if len(actions) != row.steps:
+        raise ScenarioError(
+            f"trial {row.trial} of {row.scenario_id} by {row.policy} took {len(actions)} actions for "
+            f"{row.steps} steps: it went back in time, and cannot be replayed as one run. Run its base "
+            "policy"
+        )
+    with new_file(actions_path(folder, row)) as path, open(path, "wb") as file:
+        np.save(file, actions, allow_pickle=False)
 
 
 def actions_path(folder: Path, row: TrialRow) -> Path:

@@ -71,6 +71,8 @@ class Run:
     """Of a composite policy."""
     real_time: RealTime | None = None
     """None where the simulator waits for the policy."""
+    keep: Callable[[Trial, TrialRow], None] = lambda trial, row: None
+    """Told of a trial that is over before its row is in the log: what it keeps is there for every row."""
 
     def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
@@ -134,6 +136,7 @@ class Run:
         row = trial.row(
             dataset=self.dataset, dataset_revision=self.dataset_revision, noise=noise, batch_size=batch_size
         )
+        self.keep(trial, row)
         if self.log is not None:
             self.log.append(row)
         return row

@@ -19,7 +19,7 @@ stop (`real_time`), `decide` puts what was executed while the policy thought bef
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -121,9 +121,11 @@ class Trial:
         self.success = False
         self.steps = 0
         """New environment steps; replayed ones do not count. Within S once it is over."""
+        self.attachment = b""
+        """What the simulator's side has made of it once it is over, see `ActResult`."""
         self._action_width, self._check, self._rollback_steps = action_width, handoff_check, rollback_steps
         self._sim_s = self._policy_s = 0.0
-        self._executed = hashlib.sha256()
+        self._executed: list[np.ndarray] = []
         self._record = InterventionRecord()
         self._real_time = real_time
         self._clock: MovingClock | None = None
@@ -270,6 +272,12 @@ class Trial:
             raise RuntimeError(f"{self} has no outcome yet")
         return self.outcome
 
+    @property
+    def actions(self) -> np.ndarray:
+        """(n, A), what was executed, of the type that the policy gave: replaying it is exact only in that
+        type."""
+        return np.stack(self._executed) if self._executed else np.empty((0, self._action_width), np.float32)
+
     def row(self, *, dataset: str, dataset_revision: str | None, noise: str, batch_size: int) -> TrialRow:
         """Its row.
 
@@ -296,7 +304,7 @@ class Trial:
             handoff=self.handoff,
             sim_s=self._sim_s,
             policy_s=self._policy_s,
-            actions_sha256=self._executed.hexdigest(),
+            actions_sha256=actions_digest(self._executed),
             interventions=self._record.entries(),
         )
 
@@ -309,7 +317,7 @@ class Trial:
         steps = reply.steps if isinstance(reply, ActResult) else 1
         self._sim_s += reply.seconds
         for index, action in enumerate(self._sent[:steps]):
-            self._executed.update(np.ascontiguousarray(action).tobytes())
+            self._executed.append(np.array(action))
             if self._directives:
                 if index:  # the first was noted when it was decided on
                     self._record.note(self._directives[index], self.steps + index)
@@ -317,6 +325,8 @@ class Trial:
         self.steps += steps
         if reply.observation is not None:
             self.observation = reply.observation
+        if isinstance(reply, ActResult):
+            self.attachment = reply.attachment
         if reply.success:
             self._record.solved()
         horizon = self.scenario.task.horizon
@@ -339,6 +349,14 @@ class Trial:
         if self.state not in states:
             raise RuntimeError(f"{self} cannot become {to}: that follows {' or '.join(states)} only")
         self.state = to
+
+
+def actions_digest(actions: Iterable[np.ndarray]) -> str:
+    """What a trial row calls `actions_sha256`."""
+    digest = hashlib.sha256()
+    for action in actions:
+        digest.update(np.ascontiguousarray(action).tobytes())
+    return digest.hexdigest()
 
 
 def action_problem(scenario: TrialStart, action: np.ndarray, width: int) -> str:

@@ -119,6 +119,9 @@ class ActResult:
     """Wall time of the simulator, observation included."""
     frames: tuple[np.ndarray, ...] = ()
     """(H, W, 3) uint8 after each step, where the trial is filmed."""
+    attachment: bytes = b""
+    """What the slot's server has made of a trial that is over, for the parent to keep: in a collection the
+    rollout's record."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.platforms.starts import Starts, stream
 from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.workers.messages import More, SlotConfig
 from lerobot_roborecover.workers.slots import SlotPool
 from tests.support.processes import PATIENCE_S
@@ -42,8 +43,8 @@ def units(seeds=(0, 1, 2), *, perturbed=False, tasks=("toy",), trials=1, horizon
     )  # fmt: skip
 
 
-def config(folder, seed=5):
-    settings_ = {"folder": str(folder), "seed": seed, "expert": "expert_biased", "perturbed_steps": 20}
+def config(seed=5):
+    settings_ = {"seed": seed, "expert": "expert_biased", "perturbed_steps": 20}
     return SlotConfig("fake", {}, server=SERVER, settings=settings_)
 
 
@@ -53,6 +54,13 @@ def ask(server, command, argument):
     while isinstance(reply, More):
         reply = server.answer(command)
     return reply
+
+
+def drive(server, folder, planned):
+    """A rollout to its end, its record kept as the book does."""
+    ended = ask(server, "drive", planned)
+    write_whole(record_path(folder, planned.record_name), ended.record)
+    return ended
 
 
 def contents(folder):
@@ -148,12 +156,12 @@ def test_a_rollout_depends_on_its_start_alone(order, split, tmp_path_factory):
     """Whichever server drives it, after whichever others."""
     made = units((0, 1, 2), perturbed=True)
     folders = [tmp_path_factory.mktemp("records") for _ in range(2)]
-    one = CollectServer(config(folders[0]))
+    one = CollectServer(config())
     for scenario in made:
-        ask(one, "drive", scenario)
-    servers = [CollectServer(config(folders[1])) for _ in range(2)]
+        drive(one, folders[0], scenario)
+    servers = [CollectServer(config()) for _ in range(2)]
     for place, index in enumerate(order):
-        ask(servers[place >= split], "drive", made[index])
+        drive(servers[place >= split], folders[1], made[index])
     assert contents(folders[0]) == contents(folders[1])
     assert len(contents(folders[0])) == 6
 
@@ -171,7 +179,7 @@ def test_perturbation_is_the_papers_and_stops_where_the_platform_cannot_follow(t
     original = server.make_driver
     server.make_driver = lambda *_: Straight()
     try:
-        ask(CollectServer(config(tmp_path)), "drive", replace(scenario, task=replace(TASK, horizon=60)))
+        drive(CollectServer(config()), tmp_path, replace(scenario, task=replace(TASK, horizon=60)))
     finally:
         server.make_driver = original
     record = read_record(record_path(tmp_path, scenario.id))
@@ -194,7 +202,7 @@ def test_perturbation_is_the_papers_and_stops_where_the_platform_cannot_follow(t
         flags.append(int(flag))
     assert flags.count(PERTURBED) > 5
     twin = replace(scenario, twin=True)
-    ask(CollectServer(config(tmp_path)), "drive", twin)
+    drive(CollectServer(config()), tmp_path, twin)
     assert not read_record(record_path(tmp_path, twin.record_name)).steps.perturbation.any()
 
 
@@ -210,9 +218,9 @@ def test_reach_decides_at_the_walls():
 
 
 def test_a_film_is_compared_with_the_rollout(tmp_path):
-    server = CollectServer(config(tmp_path))
+    server = CollectServer(config())
     scenario = units((0,))[0]
-    ask(server, "drive", scenario)
+    drive(server, tmp_path, scenario)
     record = read_record(record_path(tmp_path, scenario.id))
     poses = np.stack(list(record.steps.bodies.values()))
     job = FilmJob(Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses)
@@ -243,13 +251,13 @@ def roll(work, made, slots, stop_after=None):
     book = RolloutBook(work)
     ended = []
 
-    def on_end(end):
-        book.add(end)
+    def on_end(end, record):
+        book.add(end, record)
         ended.append(end.rollout)
         if stop_after is not None and len(ended) == stop_after:
             raise KeyboardInterrupt
 
-    pool = SlotPool(config(book.records), workers=True, timeout_s=PATIENCE_S)
+    pool = SlotPool(config(), workers=True, timeout_s=PATIENCE_S)
     pool.acquire()
     try:
         run_expert([u for u in made if book.find(u.id) is None], pool, slots, on_end)
@@ -294,7 +302,7 @@ def test_the_journal_is_one_process_own(tmp_path):
     book = RolloutBook(tmp_path)
     with pytest.raises(ScenarioError, match="another process"):
         RolloutBook(tmp_path)
-    book.add(Ended("a", "success", 3))
+    book.add(Ended("a", "success", 3), b"")
     book.close()
     (tmp_path / "rollouts.jsonl").open("a").write('{"schema": 1, "rollout": "b", "outcome": "won"}\n')
     with pytest.raises(ScenarioError, match="not a rollout's end"):

@@ -153,16 +153,16 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
     from lerobot_roborecover.platforms.names import choose_tasks
     from lerobot_roborecover.platforms.starts import Starts
     from lerobot_roborecover.workers.messages import SlotConfig
-    from tests.curation.test_collect import ask
+    from tests.curation.test_collect import ask, drive
 
     tasks = choose_tasks(platform_named("metaworld").tasks(), ["reach-wall-v3", "push-v3"])
     made = make_units(tasks, Starts(seeds=(0,)), "expert_biased", np.zeros(4), perturbed=True)
-    settings = {"folder": str(tmp_path), "seed": 7, "expert": "expert_biased"}
+    settings = {"seed": 7, "expert": "expert_biased"}
     server = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}, settings=settings))
     film = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}))
     flags = set()
     for scenario in made:
-        ended = ask(server, "drive", scenario)
+        ended = drive(server, tmp_path, scenario)
         record = read_record(tmp_path / f"{scenario.id}.npz")
         assert len(record.actions) == ended.steps
         flags |= set(record.steps.perturbation[:150].tolist())

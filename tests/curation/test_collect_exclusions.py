@@ -150,4 +150,4 @@ def test_touched_is_what_ends_off_its_undisturbed_path():
 
 
 def test_settings_are_plain_values():
-    assert RecorderSettings("x").perturbed_steps == 150  # the paper's
+    assert RecorderSettings().perturbed_steps == 150  # the paper's

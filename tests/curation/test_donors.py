@@ -24,11 +24,11 @@ from lerobot_roborecover.curation.donors import (
 from lerobot_roborecover.curation.policy_trials import (
     ACTIONS_FOLDER,
     PolicyTrial,
-    actions_digest,
     actions_path,
     read_trials,
 )
 from lerobot_roborecover.datasets import write_scenarios
+from lerobot_roborecover.env.trial import actions_digest
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import ScenarioError

@@ -1,12 +1,13 @@
 """What is recorded of a rollout, and the simulator that records it while somebody else drives.
 
 The recorder stands between whoever drives and the simulator, in the simulator's own process, because that is
-where an action's perturbation can be tested for reach, step by step. A finished rollout is a file before the
-driver hears of it.
+where an action's perturbation can be tested for reach, step by step. The record travels to the parent with
+the reply that ends the rollout, and becomes a file there: the simulator may be on another machine.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import zipfile
@@ -24,15 +25,12 @@ from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.starts import stream
 from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
 from lerobot_roborecover.scenario import Reset, ScenarioError
-from lerobot_roborecover.whole import new_file
 
 
 @dataclass(frozen=True)
 class RecorderSettings:
     """How rollouts are recorded; plain values, so that they travel to a worker."""
 
-    folder: str
-    """Where the records go."""
     seed: int = 0
     """Of the perturbation and of drivers that draw."""
     expert: str = ""
@@ -67,28 +65,29 @@ def record_path(folder: str | os.PathLike[str], rollout_id: str) -> Path:
     return Path(folder) / f"{rollout_id}.npz"
 
 
-def write_record(path: Path, record: Record) -> None:
-    """Writes a record, on disk when this returns."""
+def pack_record(record: Record) -> bytes:
+    """Content of a record's file."""
     about = {
         "schema": 1,
         "bodies": list(record.steps.bodies),
         "reset": record.reset.as_json(),
         "workspace": None if record.workspace is None else asdict(record.workspace),
     }
-    with new_file(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file,
-            about=np.array(json.dumps(about)),
-            actions=record.actions,
-            poses=np.stack(list(record.steps.bodies.values())),
-            solved=record.steps.solved,
-            perturbation=record.steps.perturbation,
-            margin_rad=record.margin_rad,
-        )
+    file = io.BytesIO()
+    np.savez_compressed(
+        file,
+        about=np.array(json.dumps(about)),
+        actions=record.actions,
+        poses=np.stack(list(record.steps.bodies.values())),
+        solved=record.steps.solved,
+        perturbation=record.steps.perturbation,
+        margin_rad=record.margin_rad,
+    )
+    return file.getvalue()
 
 
 def read_record(path: Path) -> Record:
-    """Reads what `write_record` wrote.
+    """Reads a file of `pack_record`'s.
 
     Raises:
         ScenarioError: the file is missing or damaged.
@@ -156,11 +155,9 @@ class RecordingSimulator:
         self._margins = [self._margin_rad()]
 
     def step(self, action: np.ndarray) -> None:
-        """Perturbs, executes in float64, records; writes the record with the last action."""
+        """Perturbs, executes in float64, records."""
         self._recorder.step(*self._disturbed(np.array(action, dtype=np.float64)))
         self._margins.append(self._margin_rad())
-        if len(self._recorder) > self._settling and self.over:
-            self._write()
 
     @property
     def over(self) -> bool:
@@ -180,14 +177,13 @@ class RecordingSimulator:
     def _margin_rad(self) -> float:
         return np.nan if self._limits is None else self._limits.joint_margin_rad()
 
-    def _write(self) -> None:
-        assert self._plan is not None
+    def record(self) -> Record:
+        """The rollout so far."""
         rollout = self._recorder.rollout
-        record = Record(
+        return Record(
             rollout.reset,
             rollout.actions,
             self._recorder.steps,
             np.array(self._margins),
             None if self._limits is None else self._limits.workspace(),
         )
-        write_record(record_path(self._settings.folder, self._plan.record_name), record)

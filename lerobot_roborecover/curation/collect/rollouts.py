@@ -11,11 +11,12 @@ from lerobot_roborecover.curation.collect.record import record_path
 from lerobot_roborecover.curation.collect.server import Driven
 from lerobot_roborecover.curation.collect.starts import Planned
 from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.env.trial import FAILURES
+from lerobot_roborecover.env.trial import FAILURES, Trial
 from lerobot_roborecover.env.trial_log import Protocol, TrialRow
 from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.units import Unit, UnitQueue
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.workers.dispatch import each
 from lerobot_roborecover.workers.messages import SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool
@@ -82,8 +83,15 @@ class RolloutBook:
             return None
         return ended
 
-    def add(self, ended: Ended) -> None:
-        """Writes an end down."""
+    def add(self, ended: Ended, record: bytes) -> None:
+        """Writes an end down, its record first, so that no end is without one.
+
+        Args:
+            ended: how.
+            record: content of the record's file; empty where it did not come to its end.
+        """
+        if record:
+            write_whole(record_path(self.records, ended.rollout), record)
         self._journal.append(asdict(ended))
         self._ended[ended.rollout] = ended
 
@@ -92,7 +100,8 @@ class RolloutBook:
         self._journal.close()
 
 
-type OnEnd = Callable[[Ended], None]
+type OnEnd = Callable[[Ended, bytes], None]
+"""Told how a rollout ended, with the content of its record's file."""
 
 
 def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnEnd) -> None:
@@ -113,10 +122,10 @@ def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnE
     for unit, reply in each(workers, "drive", take, lambda u: u.scenario):
         name = unit.scenario.record_name
         if isinstance(reply, SlotFailure):
-            on_end(Ended(name, FAILURES[reply.kind].value, 0, reply.message))
+            on_end(Ended(name, FAILURES[reply.kind].value, 0, reply.message), b"")
         else:
             assert isinstance(reply, Driven)
-            on_end(Ended(name, reply.outcome.value, reply.steps, reply.reason))
+            on_end(Ended(name, reply.outcome.value, reply.steps, reply.reason), reply.record)
 
 
 def run_policy(
@@ -137,11 +146,11 @@ def run_policy(
     if not units:
         return
     protocol = Protocol("recovery", 0, units[0].driver, seed, None)
-    run = Run(pool, protocol, None, "collect", None, handoff_check=False)
-    names = {u.id: u.record_name for u in units}
 
-    def told(row: TrialRow) -> None:
-        on_end(Ended(names[row.scenario_id], row.outcome, row.steps, row.reason))
+    def keep(trial: Trial, row: TrialRow) -> None:
+        assert isinstance(trial.scenario, Planned)
+        on_end(Ended(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment)
 
-    engine = LocalEngine(run, host, slots=min(slots, len(units)), on_row=told)
+    run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
+    engine = LocalEngine(run, host, slots=min(slots, len(units)))
     engine.run([Unit(u, u.trial) for u in units])

@@ -63,16 +63,14 @@ def roll_out(
     if not left:
         return
 
-    def on_end(ended: Ended) -> None:
-        book.add(ended)
+    def on_end(ended: Ended, record: bytes) -> None:
+        book.add(ended, record)
         count.done += 1
         count.ended += 1
         count.solved += ended.outcome == "success"
         line.show(count)
 
-    settings = asdict(
-        RecorderSettings(str(book.records.resolve()), options.seed, options.expert, options.perturbed_steps)
-    )
+    settings = asdict(RecorderSettings(options.seed, options.expert, options.perturbed_steps))
     slot = replace(spec.slot, server=SERVER, settings=settings, environment=_drawing(options, env))
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
     pool.acquire()

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
 from lerobot_roborecover.curation.collect.experts import make_driver
-from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator
+from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator, pack_record
 from lerobot_roborecover.curation.collect.starts import Planned
 from lerobot_roborecover.env.slot_server import SlotServer
 from lerobot_roborecover.platforms import Observation, Simulator
 from lerobot_roborecover.platforms.starts import stream
 from lerobot_roborecover.platforms.walk import advance, walk
-from lerobot_roborecover.scenario import Outcome, Rollout
-from lerobot_roborecover.workers.messages import EpisodeSpec, EpisodeStart, More, SlotConfig
+from lerobot_roborecover.scenario import Outcome, Rollout, TrialStart
+from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, More, SlotConfig
 
 SERVER = f"{__name__}:CollectServer"
 REPLY_EVERY_S = 5.0
@@ -32,6 +32,8 @@ class Driven:
     steps: int
     """Actions after settling."""
     reason: str = ""
+    record: bytes = b""
+    """Content of the record's file, where it came to its end."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,17 @@ class CollectServer(SlotServer):
             self._recording.plan(spec.scenario)
         return super()._reset(spec)
 
+    def _smoke(self, scenario: TrialStart) -> np.ndarray | None:
+        if self._recording is not None and isinstance(scenario, Planned):
+            self._recording.plan(scenario)
+        return super()._smoke(scenario)
+
+    def _act(self, actions: np.ndarray) -> ActResult:
+        result = super()._act(actions)
+        if self._recording is None or not result.over:
+            return result
+        return replace(result, attachment=pack_record(self._recording.record()))
+
     def _drive(self, planned: Planned) -> Iterator[Driven | None]:
         """A rollout; yields None after each step, and at last how it ended."""
         assert self._recording is not None
@@ -116,7 +129,8 @@ class CollectServer(SlotServer):
             simulator.step(action)
             if simulator.over:
                 solved = simulator.succeeded()
-                yield Driven(Outcome.SUCCESS if solved else Outcome.HORIZON, t + 1)
+                outcome = Outcome.SUCCESS if solved else Outcome.HORIZON
+                yield Driven(outcome, t + 1, record=pack_record(simulator.record()))
                 return
             yield None
 

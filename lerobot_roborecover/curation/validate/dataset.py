@@ -24,7 +24,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.curation.validate.jobs import make_jobs, read_screening, simulator_versions
 from lerobot_roborecover.curation.validate.originals import OriginalFrames
-from lerobot_roborecover.curation.validate.replay import ReplayJob, replay_job
+from lerobot_roborecover.curation.validate.replay import ReplayJob, ReplayReport, replay_job
 from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.curation.validate.sheets import write_page
 from lerobot_roborecover.curation.validate.validation import (
@@ -40,7 +40,7 @@ from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.whole import check_new, new_folder, write_whole
 from lerobot_roborecover.words import next_line
 from lerobot_roborecover.workers.jobs import Done, JobPool, Outcome
 from lerobot_roborecover.workers.messages import SlotFailure
@@ -149,7 +149,9 @@ def replay_all(
             entry = known.get(job.key)
             if len(job.runs) < request.rule.runs:
                 found[scenario.id] = Replays()
-            elif entry is not None and (job.sheet is None or entry["replays"]["error"] or job.sheet.exists()):
+            elif entry is not None and (
+                not job.sheet or entry["replays"]["error"] or request.sheet(scenario.id).exists()
+            ):
                 found[scenario.id] = replays_from(entry["replays"])
             else:
                 todo.append(job)
@@ -158,14 +160,17 @@ def replay_all(
         # A process of its own for each, so that one which crashes or hangs is only its own end.
         with JobPool(workers=request.workers, limit_s=request.limit_s, fresh=True) as pool:
             for job, outcome in pool.outcomes(replay_job, ready, lambda job: (job,)):
-                result = _replays_of(job, outcome)
+                report = _report_of(job, outcome)
+                result = report.replays
+                if report.sheet:
+                    write_whole(request.sheet(job.scenario.id), report.sheet)
                 journal.append({"key": job.key, "id": job.scenario.id, "replays": asdict(result)})
                 found[job.scenario.id] = result
                 progress(len(found), len(scenarios))
     return found
 
 
-def _replays_of(job: ReplayJob, outcome: Outcome) -> Replays:
+def _report_of(job: ReplayJob, outcome: Outcome) -> ReplayReport:
     """What a job came to.
 
     Raises:
@@ -174,10 +179,10 @@ def _replays_of(job: ReplayJob, outcome: Outcome) -> Replays:
     if isinstance(outcome, Done):
         return outcome.value
     if isinstance(outcome, SlotFailure):
-        return Replays(error=outcome.message, error_kind=CRASH)
+        return ReplayReport(Replays(error=outcome.message, error_kind=CRASH))
     if isinstance(outcome.error, ScenarioError):
         raise ScenarioError(f"scenario {job.scenario.id}: {outcome.error}")
-    return Replays(error=outcome.words, error_kind=CRASH)
+    return ReplayReport(Replays(error=outcome.words, error_kind=CRASH))
 
 
 def check_replaceable(out: Path) -> None:

@@ -90,7 +90,7 @@ def make_jobs(
             tuple(_drawn(name, t, mine) for name, t in drawn),
             mine,
             rollout,
-            sheet=request.folder / "sheets" / f"{scenario.id}.png" if request.rule.frames else None,
+            sheet=request.rule.frames,
         )
         jobs[scenario.id] = replace(job, key=_key(job, originals.identity(scenario)))
     return jobs

@@ -9,7 +9,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,9 +63,18 @@ class ReplayJob:
     rollout: OriginalRollout | None = None
     originals: Originals | None = None
     """None compares no frames."""
-    sheet: Path | None = None
-    """Where to draw original, replay and difference."""
+    sheet: bool = False
+    """Whether to draw original, replay and difference."""
     key: str = ""
+
+
+@dataclass(frozen=True)
+class ReplayReport:
+    """What comes back of a job; the parent writes it down."""
+
+    replays: Replays
+    sheet: bytes = b""
+    """A PNG; empty where there is nothing to see."""
 
 
 class _InvalidAction(Exception):
@@ -81,21 +89,21 @@ class _ReplayTrace:
     pictures: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
 
 
-def replay_job(job: ReplayJob) -> Replays:
+def replay_job(job: ReplayJob) -> ReplayReport:
     """Replays everything; what the simulator does wrong is in the result."""
     simulators: dict[str, Simulator] = {}
     try:
         return _replay(job, simulators)
     except _InvalidAction as err:
-        return Replays(error=str(err), error_kind=INVALID_ACTION)
+        return ReplayReport(Replays(error=str(err), error_kind=INVALID_ACTION))
     except (SimulatorError, RuntimeError, ArithmeticError) as err:
-        return Replays(error=f"{type(err).__name__}: {err}", error_kind=CRASH)
+        return ReplayReport(Replays(error=f"{type(err).__name__}: {err}", error_kind=CRASH))
     finally:
         for simulator in simulators.values():
             simulator.close()
 
 
-def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> Replays:
+def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> ReplayReport:
     scenario, originals = job.scenario, job.originals
 
     def simulator_of(options: Mapping[str, Any]) -> Simulator:
@@ -121,10 +129,11 @@ def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> Replays:
         if recorded:
             after_mm = max(_displacements(met.bodies, recorded)[:2])
     similarity, worst = _compare_frames(job, seen, tail) if originals else ({}, None)
-    if job.sheet is not None and worst is not None and originals is not None:
-        draw_sheet(job.sheet, scenario.id, len(scenario.prefix), originals.pictures, worst)
+    sheet = b""
+    if job.sheet and worst is not None and originals is not None:
+        sheet = draw_sheet(scenario.id, len(scenario.prefix), originals.pictures, worst)
     poses = seen[0].bodies[len(scenario.prefix)] if seen else {}
-    return Replays(
+    found = Replays(
         tuple(runs),
         after_mm,
         similarity,
@@ -132,6 +141,7 @@ def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> Replays:
         bodies={name: (*p.position_m, *p.quat_xyzw) for name, p in poses.items()},
         versions=dict(simulator_of(job.runs[0].options).fingerprint()) if job.runs else {},
     )
+    return ReplayReport(found, sheet)
 
 
 def _seen_from(scenario: Scenario, originals: Originals | None, rollout: OriginalRollout | None) -> int:

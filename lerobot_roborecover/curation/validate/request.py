@@ -42,6 +42,10 @@ class ValidationRequest:
         """The working folder."""
         return self.work or self.out.with_name(f"{self.out.name}.replays")
 
+    def sheet(self, scenario_id: str) -> Path:
+        """A scenario's contact sheet."""
+        return self.folder / "sheets" / f"{scenario_id}.png"
+
 
 def read_rejects(path: Path | None) -> dict[str, str]:
     """Rejections from a file: a line each, the id, a blank, the reason; lines that begin with # are left out.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from lerobot_roborecover.curation.attrition import Decision
 from lerobot_roborecover.curation.validate.validation import Replays, ValidationRule
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import new_file, write_whole
+from lerobot_roborecover.whole import write_whole
 
 AMPLIFIED = 4
 """What differences are multiplied with, to be seen."""
@@ -21,16 +22,14 @@ _SIDE = 240
 
 
 def draw_sheet(
-    path: Path,
     scenario_id: str,
     step: int,
     originals: Mapping[str, np.ndarray],
     replays: Mapping[str, np.ndarray],
-) -> None:
-    """Writes one scenario's sheet: three rows a camera, one column a frame, the recovery point last.
+) -> bytes:
+    """One scenario's sheet as a PNG: three rows a camera, one column a frame, the recovery point last.
 
     Args:
-        path: the PNG; its folder is made.
         scenario_id: for the labels.
         step: the recovery point.
         originals: (K, H, W, 3) uint8 by camera.
@@ -57,8 +56,9 @@ def draw_sheet(
         draw.text((2, top + 1), label, fill="black")
         sheet.paste(band, (0, top + _STRIP))
         top += band.height + _STRIP
-    with new_file(path) as temporary:
-        sheet.save(temporary, "PNG")
+    file = io.BytesIO()
+    sheet.save(file, "PNG")
+    return file.getvalue()
 
 
 def write_page(
