@@ -14,8 +14,13 @@ from lerobot_roborecover.scenario import Pose, Reset, Task
 type Observation = dict[str, Any]
 """LeRobot's raw observation of the platform: nested dicts of arrays, before any processor."""
 
-HANDLE, GOAL = ".handle", "goal"
-"""Names of marks among the bodies; see `Simulator.bodies`."""
+HANDLE, GOAL, GOAL_OF = ".handle", "goal", ".goal"
+"""Names of marks among the bodies, or their endings; see `Simulator.bodies`."""
+
+
+def is_mark(name: str) -> bool:
+    """Whether what `Simulator.bodies` names is a mark, and nothing that moves by itself."""
+    return name == GOAL or name.endswith((HANDLE, GOAL_OF))
 
 
 class SimulatorError(RoboRecoverError, RuntimeError):
@@ -60,8 +65,9 @@ class Simulator(Protocol):
     def bodies(self) -> dict[str, Pose]:
         """World poses; names that start with `eef` are end effectors, the rest whatever else can move.
 
-        A platform may add two marks without a direction of their own: `<body>` + `HANDLE`, the point of a
-        body that the task is about, and `GOAL`, where the task wants that point.
+        A platform may add marks without a direction of their own: `<body>` + `HANDLE`, the point of a body
+        that the task is about, and `GOAL`, where the task wants that point; or, where it has several places
+        to bring something to, `<body>` + `GOAL_OF` for each body, where the task wants it.
         """
 
     def state_sha256(self) -> str:

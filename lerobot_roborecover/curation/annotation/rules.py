@@ -75,12 +75,12 @@ class _Seen:
         self._reach = {name: _need(look.values(name, "reach")) for name in names}
         self._moved = {name: _need(look.values(name, "moved")) for name in names}
         self._height = {name: _need(look.values(name, "height")) for name in names}
+        self.hand_m_s = _need(look.values(HAND, "speed"))
         self.main = self._handled(look, names)
         self.others = [name for name in names if name != self.main]
         goal = look.values(self.main, "goal")
         self.goal = np.full(self.n, np.inf) if goal is None else goal
         self._has_goal = goal is not None
-        self.hand_m_s = _need(look.values(HAND, "speed"))
         self.closed = look.closed()
         self.pushes = self._has_goal and not look.grips()
         """Nothing can be held: what has a place is pushed there."""
@@ -89,10 +89,16 @@ class _Seen:
         self.labels = [self._label(i) for i in range(self.n)]
 
     def _handled(self, look: Look, names: list[str]) -> str:
-        """The object with a goal; where none has one, the one that ends farthest from where it began."""
-        if look.values(names[0], "goal") is not None:
-            return names[0]
-        return max(names, key=lambda name: self._moved[name][-1])
+        """The object with a goal; of several, the one that the hand is nearest to in the end (where a person
+        stopped, of a human-made rollout) among those that are not at their place yet; where none has one, the
+        one that ends farthest from where it began."""
+        goals = {name: away for name in names if (away := look.values(name, "goal")) is not None}
+        if not goals:
+            return max(names, key=lambda name: self._moved[name][-1])
+        first, after = self._pause() if look.sheet.human else (self.n - 1, self.n)
+        at = max((first + after) // 2, 0)
+        pending = [name for name, away in goals.items() if away[at] >= self.eye.place_m] or list(goals)
+        return min(pending, key=lambda name: self._reach[name][at])
 
     def fallen(self) -> bool:
         """The object fell off the table."""
@@ -130,6 +136,14 @@ class _Seen:
 
     def human_point(self) -> tuple[int, tuple[Stage, DeviationType]] | None:
         """Where the person stopped for longest, before putting it right."""
+        for i in range(*self._pause()):
+            label = self.labels[i]
+            if label is not None:
+                return i, label
+        return None
+
+    def _pause(self) -> tuple[int, int]:
+        """First look, and the one after the last, of the hand's longest pause; (-1, -1) where there is none."""
         longest, began = (0.0, -1, -1), None
         for i in range(self.n + 1):
             slow = i < self.n and self.hand_m_s[i] < PAUSE_M_S
@@ -139,13 +153,7 @@ class _Seen:
                 longest = max(longest, (self.seconds[i - 1] - self.seconds[began], began, i))
                 began = None
         lasted, first, after = longest
-        if lasted < PAUSE_S:
-            return None
-        for i in range(first, after):
-            label = self.labels[i]
-            if label is not None:
-                return i, label
-        return None
+        return (-1, -1) if lasted < PAUSE_S else (first, after)
 
     def _grasps(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) bool: the object is in the grasp; it has been carried within one grasp before or now."""

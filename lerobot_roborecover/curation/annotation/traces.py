@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.candidates import Suggestion
 from lerobot_roborecover.platforms import platform_named, platform_names
-from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
+from lerobot_roborecover.platforms.simulator import GOAL, GOAL_OF, HANDLE, is_mark
 from lerobot_roborecover.recording import Steps
 
 MOVING_M_S = 0.02
@@ -91,8 +91,7 @@ def action_labels(platform: str, width: int) -> dict[str, str]:
 
 def positions(steps: Steps) -> dict[str, np.ndarray]:
     """(T + 1, 3) metres of every object; where it has a handle (`Simulator.bodies`), that of its handle."""
-    marks = {n for n in steps.bodies if n == GOAL or n.endswith(HANDLE)}
-    objects = {n: p for n, p in steps.bodies.items() if n not in marks and not n.startswith("eef")}
+    objects = {n: p for n, p in steps.bodies.items() if not is_mark(n) and not n.startswith("eef")}
     return {n: steps.bodies.get(n + HANDLE, p)[:, :3] for n, p in objects.items()}
 
 
@@ -101,8 +100,8 @@ def _places(
 ) -> dict[str, Place]:
     found = {}
     for name, points in objects.items():
-        handled = GOAL in steps.bodies and name + HANDLE in steps.bodies
-        goal = np.linalg.norm(points - steps.bodies[GOAL][:, :3], axis=1)[:-1] if handled else None
+        mark = steps.bodies.get(GOAL if name + HANDLE in steps.bodies else name + GOAL_OF)
+        goal = None if mark is None else np.linalg.norm(points - mark[:, :3], axis=1)[:-1]
         reach = np.min([np.linalg.norm(points - hand, axis=1) for hand in hands], axis=0)[:-1]
         away = points - points[min(start, len(points) - 1)]
         found[name] = Place(reach, goal, np.linalg.norm(away, axis=1)[:-1], away[:-1, 2])

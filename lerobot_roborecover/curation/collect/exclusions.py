@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_roborecover.curation.collect.record import Record
-from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
+from lerobot_roborecover.platforms.simulator import is_mark
 from lerobot_roborecover.recording import PERTURBED
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -95,7 +95,7 @@ def objects_of(record: Record) -> dict[str, np.ndarray]:
     return {
         name: poses
         for name, poses in record.steps.bodies.items()
-        if not name.startswith("eef") and not name.endswith(HANDLE) and name != GOAL
+        if not name.startswith("eef") and not is_mark(name)
     }
 
 

@@ -16,12 +16,12 @@ from lerobot_roborecover.platforms.libero.articulated import (
     JointMotion,
     KnobTurn,
 )
-from lerobot_roborecover.platforms.libero.goals import turn_of
+from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS, turn_of
 from lerobot_roborecover.platforms.libero.insert import PlaceInside, on_sill
 from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
 from lerobot_roborecover.platforms.libero.pick_place import PickPlace
 from lerobot_roborecover.platforms.libero.push import RimSlide
-from lerobot_roborecover.platforms.libero.scene import PICK_AND_PLACE, Goal, LiberoScene
+from lerobot_roborecover.platforms.libero.scene import Goal, LiberoScene
 
 __all__ = ["Flaws", "LiberoExpert"]
 
@@ -59,9 +59,9 @@ class LiberoExpert:
                 return DrawerPull(scene, opened, flaws)
         if _WIDE in first.item:
             return RimSlide(scene, first, flaws)
-        if first.predicate[0] in PICK_AND_PLACE:
+        if first.predicate[0] in PLACE_KINDS:
             kind = PickPlace if scene.door(first.region) is None else PlaceInside
-            return kind(scene, [g for g in self._goals if g.predicate[0] in PICK_AND_PLACE], flaws)
+            return kind(scene, [g for g in self._goals if g.predicate[0] in PLACE_KINDS], flaws)
         return _joint_motion(scene, first, flaws)
 
 

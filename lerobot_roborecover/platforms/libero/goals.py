@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 GOAL_KINDS = ("on", "in", "open", "close", "turnon")
 """Every predicate of the four suites' goals."""
+PLACE_KINDS = ("on", "in")
+"""Those about where an object is."""
 PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
 """Predicates of a goal that the drivers know, and when their turn comes."""
 

@@ -12,8 +12,6 @@ from lerobot_roborecover.platforms.libero.joints import FixtureJoint
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.mujoco_state import subtree
 
-PICK_AND_PLACE = ("on", "in")
-"""Those about where an object is."""
 _ARM_M, _WRIST_M = 0.765, 0.21
 """From the Panda's shoulder to its wrist when it is nearly stretched out; thence to the fingertips."""
 _STRAIGHT_RAD = -0.15

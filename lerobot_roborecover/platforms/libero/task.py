@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
 from lerobot_roborecover.platforms.libero.assets import package_root
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.platforms.libero.reach import ArmReach
@@ -214,9 +215,15 @@ class LiberoTask:
             raise SimulatorError(f"the physics became unstable ({', '.join(unstable)}); action {action!r}")
 
     def bodies(self) -> dict[str, Pose]:
-        """World poses of the grip site (`eef`) and of everything that can move."""
+        """World poses of the grip site (`eef`) and of everything that can move, and where the goal wants it."""
         poses = {"eef": site_pose(self.data, self.robot.eef_site_id)}
-        return poses | {name: body_pose(self.data, body) for name, body in self.movable_bodies.items()}
+        poses |= {name: body_pose(self.data, body) for name, body in self.movable_bodies.items()}
+        return poses | {mark.name: mark.pose(self.data) for mark in self.place_marks}
+
+    @cached_property
+    def place_marks(self) -> tuple[PlaceMark, ...]:
+        """Of the goal's places."""
+        return place_marks(self.env, self.model)
 
     @cached_property
     def reach(self) -> ArmReach:
@@ -331,7 +338,7 @@ class LiberoTask:
         finally:
             self.env.hard_reset = False
             del self.env._initialize_sim
-        for name in ("fixture_bodies", "movable_bodies", "reach"):  # of the model before
+        for name in ("fixture_bodies", "movable_bodies", "place_marks", "reach"):  # of the model before
             self.__dict__.pop(name, None)
         return FirstReset(self.fixtures(), self.data.qacc_warmstart.copy())
 
