@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
 from lerobot_roborecover.platforms.libero.assets import package_root
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
+from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
 from lerobot_roborecover.platforms.libero.reach import ArmReach
 from lerobot_roborecover.platforms.limits import Workspace
 from lerobot_roborecover.platforms.mujoco_state import (
