@@ -143,7 +143,7 @@ class _Seen:
         return None
 
     def _pause(self) -> tuple[int, int]:
-        """First look, and the one after the last, of the hand's longest pause; (-1, -1) where there is none."""
+        """First look of the hand's longest pause, and the one after its last; (-1, -1): there is none."""
         longest, began = (0.0, -1, -1), None
         for i in range(self.n + 1):
             slow = i < self.n and self.hand_m_s[i] < PAUSE_M_S

@@ -215,7 +215,7 @@ class LiberoTask:
             raise SimulatorError(f"the physics became unstable ({', '.join(unstable)}); action {action!r}")
 
     def bodies(self) -> dict[str, Pose]:
-        """World poses of the grip site (`eef`) and of everything that can move, and where the goal wants it."""
+        """World poses of the grip site (`eef`), of everything that can move, and of the goal's marks."""
         poses = {"eef": site_pose(self.data, self.robot.eef_site_id)}
         poses |= {name: body_pose(self.data, body) for name, body in self.movable_bodies.items()}
         return poses | {mark.name: mark.pose(self.data) for mark in self.place_marks}
