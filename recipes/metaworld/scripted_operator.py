@@ -10,36 +10,47 @@ person where nobody can be asked, such as in the study that anyone re-runs; its 
 from __future__ import annotations
 
 import argparse
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from lerobot_roborecover.curation.collect.starts import parse_numbers
 from lerobot_roborecover.platforms.metaworld.experts import expert, patient_expert
-from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.studio.line_process import LineProcess
-from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
-from lerobot_roborecover.studio.teleop.serve import TeleopConfig, serve
+from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
+from lerobot_roborecover.studio.teleop.client import Client
+from lerobot_roborecover.studio.teleop.serve import TeleopConfig
 from lerobot_roborecover.studio.teleop.starts import StartPoint, first_state
+from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from recipes.metaworld.dataset import STUDY_TASKS
-from recipes.metaworld.deviations import DEVIATIONS, Deviation, Fumbled, Hand
+from recipes.scripted_operator import FILM_EVERY, OPERATOR, Attempt, Stop, Turn, drive
+from recipes.scripted_operator import record as record_turns
 
-OPERATOR = "scripted-operator"
-STOP_STEPS, MARK_AFTER = 56, 20
-"""How long it stops once the deviation is there, and when it marks it."""
-FILM_EVERY = 16
-"""Steps from one picture of the dataset to the next: software rendering is slow."""
-START_S = 300.0
+STOP = Stop(56, 20)
 _ATTEMPT_SEEDS = (1, 2)
 
 
+class Controls(Protocol):
+    """What drives: `low_dim()` as a simulator has it, and one action at a time."""
+
+    def low_dim(self) -> np.ndarray:
+        """(39,) Meta-World's numbers now."""
+
+    def point(self, name: str) -> np.ndarray:
+        """(3,) position of a body or mark, metres."""
+
+    def names(self) -> list[str]:
+        """Bodies and marks."""
+
+    def act(self, action: np.ndarray) -> bool:
+        """Executes (4,); returns whether the task is solved."""
+
+
 class Remote:
-    """A client as `metaworld_deviations.Controls`, and as the scripted policies' simulator."""
+    """A client as `Controls`, and as the scripted policies' simulator."""
 
     def __init__(self, client: Client):
         self.client = client
@@ -61,38 +72,72 @@ class Remote:
         return bool(self.client.act(np.clip(action, -1.0, 1.0))["solved"])
 
 
-def drive(client: Client, number: int, task: str, how: Deviation, rng: np.random.Generator, most: int) -> str:
-    """One recording.
+class MetaworldHand(Hand):
+    """Meta-World's hand, by its numbers.
 
     Args:
-        client: at the server.
-        number: of the start.
+        controls: of the task.
         task: its name.
-        how: the deviation.
-        rng: of its details.
-        most: steps within which the task has to be completed from the mark.
-
-    Returns:
-        The recording's id.
-
-    Raises:
-        Fumbled: the deviation did not come about, or the task could not be completed from it.
+        rng: of the motions' details.
     """
-    remote = Remote(client)
-    client.start(number, discard=True)
-    hand = Hand(remote, expert(remote, task), rng)
-    how.make(hand)
-    hand.hold(MARK_AFTER, how.grip)
-    client.mark(how.stage, how.deviation)
-    hand.hold(STOP_STEPS - MARK_AFTER, how.grip)
-    left, stopped = most - (STOP_STEPS - MARK_AFTER), int(client.status["step"])
+
+    gain = 10.0
+
+    def __init__(self, controls: Controls, task: str, rng: np.random.Generator):
+        self._controls, self._expert = controls, expert(controls, task)
+        super().__init__(rng)
+
+    def at(self) -> np.ndarray:
+        """Between the fingertips."""
+        return self._controls.point("eef")
+
+    def object(self) -> np.ndarray:
+        """The handled point."""
+        return self._controls.point(self._handled() + HANDLE)
+
+    def goal(self) -> np.ndarray:
+        """Where it belongs."""
+        return self._controls.point(GOAL)
+
+    def other(self) -> np.ndarray:
+        """The first part that is not to be handled."""
+        rest = [
+            n for n in self._controls.names() if n not in ("eef", GOAL, self._handled()) and HANDLE not in n
+        ]
+        if not rest:
+            raise Fumbled("the task has one object alone")
+        return self._controls.point(rest[0])
+
+    def target(self) -> np.ndarray:
+        """The same: what else can move is what the object is brought to."""
+        return self.other()
+
+    def over_m(self) -> float:
+        """The same for every object."""
+        return 0.055
+
+    def carried(self, far_m: float) -> bool:
+        """The object is at the hand, and no longer where it was."""
+        moved = np.linalg.norm(self.object() - self.start) > far_m
+        return bool(moved and np.linalg.norm(self.object() - self.at()) < 0.06)
+
+    def move(self, velocity: np.ndarray, grip: float) -> bool:
+        """One action."""
+        return self._controls.act(np.clip(np.array([*velocity, grip]), -1.0, 1.0))
+
+    def follow(self, t: int) -> bool:
+        """The scripted policy's."""
+        return self._controls.act(self._expert(t))
+
+    def _handled(self) -> str:
+        return next(n for n in self._controls.names() if n.endswith(HANDLE)).removesuffix(HANDLE)
+
+
+def attempts(remote: Remote, task: str) -> Iterator[Attempt]:
+    """Of the patient scripted policy, each with noise of its own."""
     for seed in _ATTEMPT_SEEDS:
         act = patient_expert(remote, task, np.random.default_rng(seed))
-        for t in range(left):
-            if remote.act(act(t)):
-                return client.finish()
-        client.back(int(client.status["step"]) - stopped)
-    raise Fumbled("the task could not be completed from there")
+        yield lambda t, act=act: remote.act(act(t))
 
 
 def record(
@@ -112,47 +157,24 @@ def record(
         Recordings by way.
     """
     starts: list[StartPoint] = []
-    plan: list[tuple[str, str, list[int]]] = []
+    turns: list[Turn] = []
     for task in tasks:
         for way in ways:
-            first = len(starts)
+            turns.append(Turn(task, way, range(len(starts), len(starts) + len(seeds))))
             for seed in seeds:
                 start = first_state("metaworld", task, seed=seed)
                 starts.append(replace(start, task=replace(start.task, horizon=horizon)))
-            plan.append((task, way, list(range(first, len(starts)))))
     config = TeleopConfig(
         out, "metaworld", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
         options={"render_quality": "fast"},
     )  # fmt: skip
-    made: Counter[str] = Counter()
-    with _server(config) as address, Client(address) as client:
-        for task, way, numbers in plan:
-            for number in numbers:
-                rng = np.random.default_rng([number, sum(map(ord, way))])
-                try:
-                    name = drive(client, number, task, DEVIATIONS[way], rng, horizon)
-                except (Fumbled, TeleopRefusal) as err:
-                    print(f"{task} {way} seed {starts[number].reset.seed}: {err}", flush=True)
-                    continue
-                made[way] += 1
-                print(f"{task} {way} seed {starts[number].reset.seed}: {name}", flush=True)
-                break
-    return made
 
+    def one(client: Client, number: int, how: Deviation, rng: np.random.Generator) -> str:
+        task, remote = starts[number].task.name, Remote(client)
+        client.start(number, discard=True)
+        return drive(client, MetaworldHand(remote, task, rng), how, STOP, attempts(remote, task), horizon)
 
-@contextmanager
-def _server(config: TeleopConfig) -> Iterator[str]:
-    """The server's address; interrupted at the end, it writes the dataset."""
-    with LineProcess("the teleoperation server", serve, config) as server:
-        until, line = time.monotonic() + START_S, ""
-        while "http://" not in line:
-            line = server.hear(until) or ""
-            if not line:
-                raise ScenarioError("the teleoperation server ended before it gave an address")
-        yield line.split()[-1]
-        server.interrupt()
-        while line := server.hear() or "":
-            print(line, flush=True)
+    return record_turns(config, turns, one)
 
 
 def main() -> None:

@@ -72,14 +72,14 @@ class Recorder:
 )
 def test_a_deviation_is_what_the_rules_call_it(task, way):
     from lerobot_roborecover.platforms.metaworld import PLATFORM
-    from lerobot_roborecover.platforms.metaworld.experts import expert
     from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-    from recipes.metaworld.deviations import DEVIATIONS, Hand
+    from recipes.deviations import DEVIATIONS
+    from recipes.metaworld.scripted_operator import MetaworldHand
 
     simulator = MetaworldSimulator(obs_type="state")
     simulator.reset(PLATFORM.task(task), Reset(seed=500))
     controls, how = Recorder(simulator), DEVIATIONS[way]
-    hand = Hand(controls, expert(controls, task), np.random.default_rng(1))
+    hand = MetaworldHand(controls, task, np.random.default_rng(1))
     how.make(hand)
     began = len(controls.actions)
     hand.hold(STOP, how.grip)

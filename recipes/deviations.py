@@ -1,95 +1,104 @@
-"""Deliberate deviations on Meta-World, one a cell: what a person at the controls would do to get there.
+"""Deliberate deviations, one a cell: what a person at the controls would do to get there.
 
-Each drives a task by its numbers (hand, gripper, object, goal) to a state that belongs to one cell.
+Each drives a task by what a `Hand` sees of it (hand, object, goal) to a state that belongs to one cell.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.platforms.base import Driver
-from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
 from lerobot_roborecover.scenario import DeviationType, Stage
 
 OPEN, CLOSED = -1.0, 1.0
-_GAIN = 10.0
 _ARRIVED_M = 0.015
-_ABOVE_M = 0.18
-"""How high above the table the hand travels."""
 
 
 class Fumbled(Exception):
-    """The deviation did not come about; another seed may do."""
+    """The deviation did not come about; another start may do."""
 
 
-class Controls(Protocol):
-    """What drives: `low_dim()` as a simulator has it, and one action at a time."""
+class Hand(ABC):
+    """Small motions out of which deviations are made.
 
-    def low_dim(self) -> np.ndarray:
-        """(39,) Meta-World's numbers now."""
+    Args:
+        rng: of their details.
+    """
 
-    def point(self, name: str) -> np.ndarray:
-        """(3,) position of a body or mark, metres."""
+    gain: float
+    """Command per metre that is left to go."""
+    support_m = 0.0
+    """Height of what everything stands on."""
+    travel_m = 0.18
+    """How high above that the hand travels."""
+    near_m = 0.1
+    """An object this near to its place has nearly arrived."""
+    aside_m: tuple[float, float] | None = None
+    """How far beside its place, at least and at most, it is let go so as not to arrive; None: there."""
 
-    def names(self) -> list[str]:
-        """Bodies and marks."""
-
-    def act(self, action: np.ndarray) -> bool:
-        """Executes (4,); returns whether the task is solved."""
-
-
-@dataclass
-class Hand:
-    """Small motions out of which deviations are made."""
-
-    controls: Controls
-    expert: Driver
-    """The task's scripted policy, for everything up to the deviation."""
-    rng: np.random.Generator
-    start: np.ndarray = field(init=False)
-
-    def __post_init__(self):
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
         self.start = self.object()
 
+    @abstractmethod
     def at(self) -> np.ndarray:
-        """(3,) between the fingertips."""
-        return self.controls.point("eef")
+        """(3,) metres: between the fingertips."""
 
+    @abstractmethod
     def object(self) -> np.ndarray:
-        """(3,) the handled point."""
-        return self.controls.point(self._handled() + HANDLE)
+        """(3,) metres: the handled point."""
 
+    @abstractmethod
     def goal(self) -> np.ndarray:
-        """(3,) where it belongs."""
-        return self.controls.point(GOAL)
+        """(3,) metres: where it belongs."""
 
+    @abstractmethod
     def other(self) -> np.ndarray:
-        """(3,) the first part that is not to be handled.
+        """(3,) metres: a part that is not to be handled.
 
         Raises:
             Fumbled: there is none.
         """
-        rest = [
-            n for n in self.controls.names() if n not in ("eef", GOAL, self._handled()) and HANDLE not in n
-        ]
-        if not rest:
-            raise Fumbled("the task has one object alone")
-        return self.controls.point(rest[0])
 
-    def _handled(self) -> str:
-        return next(n for n in self.controls.names() if n.endswith(HANDLE)).removesuffix(HANDLE)
+    @abstractmethod
+    def target(self) -> np.ndarray:
+        """(3,) metres: the movable thing that the object is to be brought to.
+
+        Raises:
+            Fumbled: there is none.
+        """
+
+    @abstractmethod
+    def over_m(self) -> float:
+        """From the handled point up to where closing fingers just miss it, metres."""
+
+    @abstractmethod
+    def carried(self, far_m: float) -> bool:
+        """Whether the object is in the grasp, and has gone along with the hand for so far."""
+
+    @abstractmethod
+    def move(self, velocity: np.ndarray, grip: float) -> bool:
+        """One command of the hand; whether the task is solved.
+
+        Args:
+            velocity: (3,), clipped to [-1, 1].
+            grip: `OPEN` to `CLOSED`.
+        """
+
+    @abstractmethod
+    def follow(self, t: int) -> bool:
+        """One action of the task's scripted driver; whether the task is solved."""
 
     def act(self, velocity: np.ndarray, grip: float) -> None:
-        """One action, clipped.
+        """One command.
 
         Raises:
             Fumbled: it solved the task.
         """
-        if self.controls.act(np.clip(np.array([*velocity, grip]), -1.0, 1.0)):
+        if self.move(velocity, grip):
             raise Fumbled("the task was solved on the way")
 
     def go(self, target: np.ndarray, grip: float, most: int = 60) -> None:
@@ -98,7 +107,7 @@ class Hand:
             error = np.asarray(target) - self.at()
             if np.linalg.norm(error) < _ARRIVED_M:
                 return
-            self.act(_GAIN * error, grip)
+            self.act(self.gain * error, grip)
 
     def hold(self, steps: int, grip: float) -> None:
         """Stays where it is."""
@@ -106,7 +115,7 @@ class Hand:
             self.act(np.zeros(3), grip)
 
     def carry(self, when: Callable[[], bool], most: int = 150) -> None:
-        """The scripted policy, until a condition holds.
+        """The scripted driver, until a condition holds.
 
         Raises:
             Fumbled: it never did.
@@ -114,22 +123,21 @@ class Hand:
         for t in range(most):
             if when():
                 return
-            if self.controls.act(self.expert(t)):
+            if self.follow(t):
                 raise Fumbled("the task was solved on the way")
-        raise Fumbled("the scripted policy did not get that far")
+        raise Fumbled("the scripted driver did not get that far")
 
     def grasp(self, far_m: float = 0.03) -> None:
-        """The scripted policy, until the object has gone along with the hand for so far."""
+        """The scripted driver, until the object has gone along with the hand for so far."""
+        self.carry(lambda: self.carried(far_m))
 
-        def carried() -> bool:
-            moved = np.linalg.norm(self.object() - self.start) > far_m
-            return bool(moved and np.linalg.norm(self.object() - self.at()) < 0.06)
-
-        self.carry(carried)
-
-    def up(self, grip: float, height_m: float = _ABOVE_M) -> None:
-        """Rises above the table."""
+    def up(self, grip: float, height_m: float) -> None:
+        """Rises to a height."""
         self.go(np.array([*self.at()[:2], height_m]), grip)
+
+    def above(self) -> float:
+        """Height at which the hand travels, metres."""
+        return self.support_m + self.travel_m
 
     def sideways(self, low_m: float, high_m: float) -> np.ndarray:
         """(3,) a random horizontal offset, rather to the sides than forth and back."""
@@ -141,7 +149,7 @@ class Hand:
 def wrong_part(hand: Hand) -> None:
     """Goes to a part that is not to be handled, and presses it."""
     part = hand.other()
-    hand.up(CLOSED, max(_ABOVE_M, part[2] + 0.1))
+    hand.up(CLOSED, max(hand.above(), part[2] + 0.1))
     hand.go(part + np.array([0.0, -0.06, 0.08]), CLOSED)
     hand.go(part + np.array([0.0, -0.02, 0.0]), CLOSED, 30)
     for _ in range(30):
@@ -153,8 +161,8 @@ def wrong_part(hand: Hand) -> None:
 def beside(hand: Hand) -> None:
     """Comes down beside the object, too far away to touch it."""
     spot = hand.object() + hand.sideways(0.14, 0.2)
-    hand.go(np.array([*spot[:2], _ABOVE_M]), OPEN)
-    hand.go(np.array([*spot[:2], max(hand.object()[2] + 0.03, 0.06)]), OPEN)
+    hand.go(np.array([*spot[:2], hand.above()]), OPEN)
+    hand.go(np.array([*spot[:2], max(hand.object()[2] + 0.03, hand.support_m + 0.06)]), OPEN)
 
 
 def dropped(hand: Hand) -> None:
@@ -162,25 +170,25 @@ def dropped(hand: Hand) -> None:
     hand.grasp()
     hand.go(hand.at() + hand.sideways(0.05, 0.1) + np.array([0.0, 0.0, 0.05]), CLOSED, 25)
     hand.hold(12, OPEN)
-    hand.up(OPEN, 0.22)
+    hand.up(OPEN, hand.above() + 0.04)
     hand.go(hand.at() + hand.sideways(0.06, 0.1), OPEN, 30)
 
 
 def knocked(hand: Hand) -> None:
     """Sweeps the object aside with a closed gripper, and rises."""
     thing, aside = hand.object(), hand.sideways(0.1, 0.12)
-    height = max(thing[2], 0.03)
-    hand.go(np.array([*(thing - aside)[:2], _ABOVE_M]), CLOSED)
+    height = max(thing[2], hand.support_m + 0.03)
+    hand.go(np.array([*(thing - aside)[:2], hand.above()]), CLOSED)
     hand.go(np.array([*(thing - aside)[:2], height]), CLOSED)
     hand.go(np.array([*(thing + 0.5 * aside)[:2], height]), CLOSED, 30)
-    hand.up(OPEN, 0.22)
+    hand.up(OPEN, hand.above() + 0.04)
 
 
 def too_high(hand: Hand) -> None:
     """Closes the gripper just above the object, beside its middle."""
     spot = hand.object() + hand.sideways(0.015, 0.03)
-    hand.go(np.array([*spot[:2], _ABOVE_M]), OPEN)
-    hand.go(np.array([*spot[:2], hand.object()[2] + 0.055]), OPEN)
+    hand.go(np.array([*spot[:2], hand.above()]), OPEN)
+    hand.go(np.array([*spot[:2], hand.object()[2] + hand.over_m()]), OPEN)
     hand.hold(12, CLOSED)
 
 
@@ -205,7 +213,7 @@ def nearly(hand: Hand) -> None:
     """Brings the object close to its place, and stops beside it."""
 
     def near() -> bool:
-        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < hand.near_m)
 
     hand.grasp()
     hand.carry(near)
@@ -216,10 +224,12 @@ def fallen_beside(hand: Hand) -> None:
     """Lets the object fall just before its place, and rises."""
 
     def near() -> bool:
-        return bool(np.linalg.norm(hand.object() - hand.goal()) < 0.1)
+        return bool(np.linalg.norm(hand.object() - hand.goal()) < hand.near_m)
 
     hand.grasp()
     hand.carry(near)
+    if hand.aside_m is not None:
+        hand.go(hand.at() + hand.sideways(*hand.aside_m), CLOSED, 15)
     hand.hold(12, OPEN)
     hand.up(OPEN, hand.at()[2] + 0.1)
 
@@ -227,13 +237,13 @@ def fallen_beside(hand: Hand) -> None:
 def place_disturbed(hand: Hand) -> None:
     """With the object in the grasp, pushes what it is to be brought to out of the way."""
     hand.grasp()
-    target = hand.other()
+    target = hand.target()
     offset = hand.object() - hand.at()
     beside_it = target - offset + np.array([0.02, 0.14, 0.0])
     hand.go(np.array([*beside_it[:2], hand.at()[2] + 0.08]), CLOSED, 50)
     hand.go(np.array([*beside_it[:2], target[2] - 0.05]), CLOSED, 30)
     for _ in range(40):
-        if np.linalg.norm(hand.other() - target) > 0.05:
+        if np.linalg.norm(hand.target() - target) > 0.05:
             break
         hand.act(np.array([0.0, -0.8, 0.0]), CLOSED)
     hand.go(hand.at() + np.array([-0.04, 0.03, 0.0]), CLOSED, 12)
