@@ -36,6 +36,8 @@ class Hand(ABC):
     """How high above that the hand travels."""
     near_m = 0.1
     """An object this near to its place has nearly arrived."""
+    settle_steps = 8
+    """For how long an object that is put down is still held."""
     aside_m: tuple[float, float] | None = None
     """How far beside its place, at least and at most, it is let go so as not to arrive; None: there."""
 
@@ -205,7 +207,7 @@ def wrong_place(hand: Hand) -> None:
     hand.go(np.array([*away, hand.at()[2]]), CLOSED, 40)
     low = hand.at() - np.array([0.0, 0.0, max(hand.object()[2] - hand.start[2], 0.0)])
     hand.go(low, CLOSED, 25)
-    hand.hold(8, CLOSED)
+    hand.hold(hand.settle_steps, CLOSED)
     hand.hold(14, OPEN)
 
 

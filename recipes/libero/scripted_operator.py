@@ -34,7 +34,7 @@ from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from recipes.scripted_operator import FILM_EVERY, OPERATOR, Stop, Turn, drive
 from recipes.scripted_operator import record as record_turns
 
-STOP = Stop(24, 8)
+STOP = Stop(30, 10)
 _CLEAR_M = 0.035
 
 
@@ -85,6 +85,7 @@ class LiberoHand(Hand):
     gain = 24.0
     travel_m = 0.27
     near_m = 0.085
+    settle_steps = 2
     aside_m = (0.05, 0.07)
 
     def __init__(self, mirror: Mirror, scene: LiberoScene, rng: np.random.Generator):
