@@ -6,7 +6,8 @@ What two scenarios share that would leak from one split into another (paper, app
   the other from the same reset;
 - record: the same source record (`provenance.source_record`), or the same recovery state;
 - instruction: the same task and instruction. On RoboTwin, where instructions vary within a task; elsewhere
-  all scenarios of a task share one.
+  all scenarios of a task share one;
+- start: the same task from the same reset (init state, seed), whoever drove.
 
 Scenarios that share anything, directly or through others, form a group that stays together. Groups of the
 same make-up (how many scenarios of each cell, source and suite) are interchangeable, so the sizes are an
@@ -26,7 +27,7 @@ import numpy as np
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
-APART = ("trajectory", "record", "instruction")
+APART = ("trajectory", "record", "instruction", "start")
 _AXES = {
     "cell": lambda s: s.cell,
     "source": lambda s: s.source.value,
@@ -123,6 +124,8 @@ def shared(scenarios: Sequence[Scenario], apart: Sequence[str]) -> dict[str, dic
                 found["record"][record].append(i)
         if "instruction" in found:
             found["instruction"][f"{scenario.task.name}: {scenario.task.instruction}"].append(i)
+        if "start" in found:
+            found["start"][" ".join(map(str, _start(scenario)))].append(i)
     if "trajectory" in found:
         for name, members in _continuations(scenarios):
             found["trajectory"][name] += members
@@ -139,8 +142,7 @@ def _continuations(scenarios: Sequence[Scenario]) -> Iterable[tuple[str, list[in
     """
     by_start: dict[tuple, list[int]] = defaultdict(list)
     for i, s in enumerate(scenarios):
-        r = s.reset
-        by_start[s.task.suite, s.task.name, r.seed, r.init_state_index, r.settle_steps].append(i)
+        by_start[_start(s)].append(i)
     for members in by_start.values():
         for i in members:
             # Settling alone is what all rollouts from one reset share.
@@ -150,6 +152,11 @@ def _continuations(scenarios: Sequence[Scenario]) -> Iterable[tuple[str, list[in
             same = [j for j in members if np.array_equal(scenarios[j].prefix[: len(short)], short)]
             if len(same) > 1:
                 yield f"beginning of {scenarios[i].id}", same
+
+
+def _start(scenario: Scenario) -> tuple:
+    task, reset = scenario.task, scenario.reset
+    return task.suite, task.name, reset.seed, reset.init_state_index, reset.settle_steps
 
 
 def groups_of(scenarios: Sequence[Scenario], apart: Sequence[str]) -> list[list[int]]:

@@ -140,6 +140,16 @@ def test_robotwin_keeps_instructions_apart_and_others_do_not():
     assert len(assign(scenarios, SplitConfig({"train": 5, "test": 3}, apart=("trajectory", "record")))) == 8
 
 
+def test_scenarios_of_one_start_stay_together_where_that_is_asked():
+    scenarios = [scenario(i, reset=Reset(seed=i // 3, settle_steps=2)) for i in range(12)]
+    config = SplitConfig({"train": 9, "test": 3}, apart=("trajectory", "record", "start"))
+    splits = assign(scenarios, config)
+    for first in range(0, 12, 3):
+        assert len({splits[f"s{i:04d}"] for i in range(first, first + 3)}) == 1
+    with pytest.raises(ScenarioError, match="not possible"):
+        assign(scenarios, SplitConfig({"train": 8, "test": 4}, apart=config.apart))
+
+
 @pytest.mark.parametrize(
     ("sizes", "said"),
     [
