@@ -48,7 +48,7 @@ def place_marks(env: LiberoEnv, model: mujoco.MjModel) -> tuple[PlaceMark, ...]:
         item, place = about
         name = model.body(env.obj_body_id[item]).name + GOAL_OF
         if place in env.object_sites_dict:
-            found.append(PlaceMark(name, model.site(place).id, -1))
+            found.append(PlaceMark(name, env.sim.model.site_name2id(place), -1))
         else:
             found.append(PlaceMark(name, None, env.obj_body_id[place]))
     return tuple(found)
