@@ -1,3 +1,11 @@
 """The module LeRobot imports: it has the distribution's own name."""
 
+import logging
+
+from lerobot_roborecover.platforms.versions import lerobot_note
+
+# Before the rest: where LeRobot has changed too much, LeRobot itself only says that importing this failed.
+if note := lerobot_note():
+    logging.getLogger(__name__).warning(note)
+
 import lerobot_roborecover.plugin  # noqa: F401

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Sets up everything that the package, the demo and the tests need, in .venv inside the clone.
-# Safe to run again: does nothing when nothing has changed. With --system only the system's packages, for root.
+# Safe to run again: does nothing when nothing has changed. With --system only the system's packages, for root;
+# with --lerobot-main PATH the same with the LeRobot of a source tree, in .venv-main beside it.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -54,33 +55,60 @@ if [[ "${1:-}" == --system ]]; then
     install_system_packages "$@"
     exit 0
 fi
+venv=.venv
+if [[ "${1:-}" == --lerobot-main ]]; then
+    tree="${2:-}"
+    [[ -f "$tree/src/lerobot/__init__.py" && -f "$tree/pyproject.toml" ]] || {
+        say "'$tree' is no source tree of LeRobot: give the folder that 'git clone https://github.com/huggingface/lerobot' made"
+        exit 1
+    }
+    venv=.venv-main
+fi
 install_system_packages "${system_packages[@]}"
 scripts/vulkan.sh >/dev/null || say "no software Vulkan: without a GPU, RoboTwin renders nothing here"
 
-stamp=".venv/.set-up"
+stamp="$venv/.set-up"
 # Another file of versions, or /dev/null for the newest that pyproject.toml allows.
 constraints="${ROBORECOVER_CONSTRAINTS:-constraints.txt}"
 wanted="$(cat pyproject.toml "$constraints" .python-version scripts/setup.sh | sha256sum)"
-if [[ -f "$stamp" && "$(cat "$stamp")" == "$wanted" ]] && .venv/bin/python -c '' 2>/dev/null; then
+[[ -z "${tree:-}" ]] || wanted+=" $(cd "$tree" && find pyproject.toml src -name '__pycache__' -prune -o -type f -not -path '*.egg-info/*' -print0 |
+    sort -z | xargs -0 cat | sha256sum)"
+if [[ -f "$stamp" && "$(cat "$stamp")" == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
     exit 0
 fi
 
 uv="$(scripts/uv.sh)"
-if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; then
+if ! "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; then
     # The first search stops at a broken interpreter, such as pyenv's stand-in for one that is not installed.
-    "$uv" venv --quiet --clear --python 3.12 .venv || "$uv" venv --quiet --clear --managed-python --python 3.12 .venv || {
+    "$uv" venv --quiet --clear --python 3.12 "$venv" || "$uv" venv --quiet --clear --managed-python --python 3.12 "$venv" || {
         say "no Python 3.12 was found and uv could not fetch one: install Python 3.12 and run this again"
         exit 1
     }
 fi
 # egl_probe asks for a CMake before 3.5, which CMake 4 refuses to be.
 export CMAKE_POLICY_VERSION_MINIMUM="${CMAKE_POLICY_VERSION_MINIMUM:-3.5}"
-say "installing Python packages in .venv (some GB the first time)"
+say "installing Python packages in $venv (some GB the first time)"
 install_python_packages() {
     # Compiled once, here: where PYTHONDONTWRITEBYTECODE is set, as in many images, every process would compile all of
     # LeRobot and torch anew, which takes it half a minute.
-    "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -c "$constraints" -e '.[gym,libero,robotwin,test]'
+    "$uv" pip install --quiet --compile-bytecode --python "$venv/bin/python" "${pinned[@]}" -e '.[gym,libero,robotwin,test]'
 }
+pinned=(-c "$constraints")
+if [[ -n "${tree:-}" ]]; then
+    # As a wheel: uv would take torch from the index that the tree names. From a copy, so that nothing is built in it.
+    copy="$(mktemp -d)"
+    trap 'rm -rf "$copy"' EXIT
+    mkdir -p "$copy/lerobot"
+    (cd "$tree" && cp -r pyproject.toml README.md src "$copy/lerobot" && for name in setup.py MANIFEST.in LICENSE; do
+        [[ ! -f "$name" ]] || cp "$name" "$copy/lerobot"
+    done)
+    "$uv" build --quiet --wheel --out-dir "$copy" "$copy/lerobot"
+    grep -v '^lerobot==' "$constraints" >"$copy/constraints.txt" || true
+    # An override says all of a requirement, its extras too.
+    extras="$("$venv/bin/python" scripts/lerobot_extras.py "$tree")"
+    echo "lerobot[$extras] @ file://$(echo "$copy"/lerobot-*.whl)" >"$copy/overrides.txt"
+    pinned=(-c "$copy/constraints.txt" --overrides "$copy/overrides.txt")
+fi
 install_python_packages || { sleep 5; install_python_packages; }
 echo "$wanted" >"$stamp"
-say "done; 'source .venv/bin/activate' puts roborecover and lerobot-eval on the PATH"
+say "done; 'source $venv/bin/activate' puts roborecover and lerobot-eval on the PATH"

@@ -6,12 +6,13 @@ from the weights before the first one (paper, "Correction Data and Training": 0.
 optimizer's state with each checkpoint and loads it on `--resume`, and the shadow with it; `roborecover
 export-ema` turns it into a plain checkpoint.
 
-LeRobot averages by itself from huggingface/lerobot#4323 on; there this optimizer refuses, and names the
-options.
+LeRobot averages by itself from huggingface/lerobot#4323 on. There this optimizer is not needed any more; it
+works as before, so that one training configuration does for both, and names the options to use instead.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any, overload
@@ -21,6 +22,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig
 
 from lerobot_roborecover.env.options import OptionError
+
+logger = logging.getLogger(__name__)
 
 SHADOW = "ema"
 """Key of the shadow in the optimizer's state of a parameter."""
@@ -92,15 +95,16 @@ class EmaAdamWConfig(AdamWConfig):
         """The optimizer.
 
         Raises:
-            OptionError: the decay is none, or LeRobot averages by itself.
+            OptionError: the decay is none.
         """
         if not 0.0 <= self.ema_decay < 1.0:
             raise OptionError(f"--optimizer.ema_decay={self.ema_decay}: at least 0, and below 1")
         if any(f.name == "ema" for f in fields(TrainPipelineConfig)):
-            raise OptionError(
-                "--optimizer.type=roborecover_ema_adamw: this LeRobot averages weights by itself. Use "
-                f"--optimizer.type=adamw --ema.enable=true --ema.min_decay={self.ema_decay} "
-                f"--ema.max_decay={self.ema_decay}"
+            logger.warning(
+                "roborecover_ema_adamw is not needed on this LeRobot, which averages weights by itself: with "
+                "'type: adamw' in place of 'type' and 'ema_decay' under 'optimizer', --ema.enable=true "
+                "--ema.decay=%s writes checkpoints/<step>/pretrained_model_ema, and export-ema is not needed",
+                self.ema_decay,
             )
         options = asdict(self)
         options.pop("grad_clip_norm")

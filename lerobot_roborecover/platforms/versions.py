@@ -7,6 +7,9 @@ from importlib import metadata
 
 from lerobot_roborecover.platforms import platform_named
 
+LEROBOT = "0.6.1"
+"""The LeRobot that this package is made for; `pyproject.toml` pins the same."""
+
 
 def installed(distribution: str) -> str | None:
     """Version of an installed distribution; None when it is not installed."""
@@ -47,3 +50,16 @@ def version_problems(platform: str) -> list[str]:
                 f"pip install '{distribution}=={versions[0]}'"
             )
     return problems
+
+
+def lerobot_note() -> str | None:
+    """One line on the LeRobot that is installed, with what to do; None where it is the known one."""
+    found = installed("lerobot")
+    if found == LEROBOT:
+        return None
+    here = f"this is LeRobot {found}" if found else "LeRobot is not installed as a package"
+    return (
+        f"lerobot_env_roborecover is made for LeRobot {LEROBOT}, and {here}: pip install "
+        f"'lerobot=={LEROBOT}'; or, to go on with this one, see what differs in docs/lerobot_main.md, and score with "
+        "--env.strict_versions=false"
+    )

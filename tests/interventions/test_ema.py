@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -179,6 +181,37 @@ def test_correction_of_a_vision_language_policy(kind, executed, tmp_path, monkey
     config = PreTrainedConfig.from_pretrained(tmp_path / "exported")
     assert config.n_action_steps == executed
     get_policy_class(kind).from_pretrained(tmp_path / "exported", config=config)
+
+
+@pytest.mark.slow
+def test_where_lerobot_averages_by_itself(donors, tmp_path, capsys):
+    """LeRobot's main: ours works and says what to use instead, and that makes a checkpoint like any other."""
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.policies import get_policy_class
+
+    from tests.support.factories import save_policy
+
+    if "ema" not in {field.name for field in fields(TrainPipelineConfig)}:
+        pytest.skip("this LeRobot keeps no average of its own: scripts/test.sh --lerobot-main PATH")
+    base = save_policy(tmp_path / "base")
+    few = ("--steps=2", "--save_checkpoint=true")
+    lerobot_train(*arguments(donors, base, tmp_path / "ours"), *few)
+    assert "--ema.enable=true --ema.decay=0.5" in capsys.readouterr().err
+    config = tmp_path / "correction.yaml"
+    text = (CONFIGS / "correction_act.yaml").read_text()
+    config.write_text(
+        re.sub(r"  ema_decay: .*\n", "", text.replace("type: roborecover_ema_adamw", "type: adamw"))
+    )
+    given = [a for a in arguments(donors, base, tmp_path / "theirs") if "ema_decay" not in a]
+    lerobot_train(f"--config_path={config}", *given[1:], *few, "--ema.enable=true", "--ema.decay=0.5")
+    last = tmp_path / "theirs" / "checkpoints" / "last"
+    act = get_policy_class("act")
+    averaged, plain = (
+        dict(act.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).named_parameters())
+        for path in (last / "pretrained_model_ema", last / "pretrained_model")
+    )
+    assert any(not averaged[name].equal(plain[name]) for name in plain)
 
 
 def test_what_holds_no_average_is_refused(tmp_path, capsys):
