@@ -60,6 +60,6 @@ def lerobot_note() -> str | None:
     here = f"this is LeRobot {found}" if found else "LeRobot is not installed as a package"
     return (
         f"lerobot_env_roborecover is made for LeRobot {LEROBOT}, and {here}: pip install "
-        f"'lerobot=={LEROBOT}'; or, to go on with this one, see what differs in docs/lerobot_main.md, and score with "
-        "--env.strict_versions=false"
+        f"'lerobot=={LEROBOT}'; or, to go on with this one, see what differs in docs/lerobot_main.md, and "
+        "score with --env.strict_versions=false"
     )
