@@ -24,6 +24,7 @@ import numpy as np
 from lerobot_roborecover.platforms.libero.assets import package_root
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
+from lerobot_roborecover.platforms.libero.osc import OscControl, osc_control
 from lerobot_roborecover.platforms.libero.reach import ArmReach
 from lerobot_roborecover.platforms.limits import Workspace
 from lerobot_roborecover.platforms.mujoco_state import (
@@ -111,6 +112,9 @@ class LiberoTask:
         self._first_resets = first_resets
         self._used = False
         self._site_rgba: np.ndarray | None = None
+        self._osc: OscControl | None = None
+        self.own_osc = True
+        """False for robosuite's own `_pre_action` where `osc.py` would do the same sooner."""
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -197,6 +201,7 @@ class LiberoTask:
             SimulatorError: the physics became unstable.
         """
         model, data, sim = self.model, self.data, self.env.sim
+        control = self._controlled() or self.env._pre_action
         # robosuite computes the forward dynamics three times per physics step: before the controller, in it,
         # and in mj_step. Each constraint solve starts from the one before, so the same bits need all three.
         # Positions, velocities and sensors, which do not change in between, are computed once.
@@ -205,7 +210,7 @@ class LiberoTask:
             for substep in range(self.substeps):
                 mujoco.mj_step1(model, data)
                 sim.forward()
-                self.env._pre_action(action, substep == 0)
+                control(action, substep == 0)
                 mujoco.mj_step2(model, data)
                 after_substep()
         finally:
@@ -315,7 +320,16 @@ class LiberoTask:
 
     def close(self) -> None:
         """Frees the model."""
+        self._osc = None
         self.env.close()
+
+    def _controlled(self) -> OscControl | None:
+        if not self.own_osc:
+            return None
+        # robosuite makes a new controller at every reset.
+        if self._osc is None or self._osc.controller is not self.robot.controller:
+            self._osc = osc_control(self.env)
+        return self._osc
 
     def _first_reset(self) -> FirstReset:
         """The first reset of a fresh environment, as LIBERO does it.

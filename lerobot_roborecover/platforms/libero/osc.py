@@ -1,0 +1,177 @@
+"""robosuite's operational-space control of LIBERO's Panda, bit for bit, without its look-ups by name.
+
+robosuite runs the controller before each of the 25 physics steps of a control step, and spends more time on
+finding out what it controls than on controlling it. Here that is found out once per controller. The floating
+point operations, their order, the compiled functions, and the memory layouts that these are given are those of
+robosuite 1.4.0 (controllers/osc.py, controllers/base_controller.py, robots/single_arm.py,
+robots/manipulator.py, models/grippers/panda_gripper.py): BLAS rounds otherwise in row than in column order.
+
+What is left out: robosuite's `recent_*` buffers of the robot, which neither LIBERO nor its snapshots look at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import metadata
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.platforms.libero.robosuite_types import LiberoEnv, OperationalSpaceController
+
+_ROBOSUITE = "1.4.0"
+"""Whose operations these are."""
+
+
+def osc_control(env: LiberoEnv) -> OscControl | None:
+    """The control of the environment's robot; None if it is not what LIBERO's own tasks have.
+
+    Args:
+        env: after a reset, which makes the controller.
+    """
+    from robosuite.controllers.osc import OperationalSpaceController
+    from robosuite.models.grippers.panda_gripper import PandaGripper
+    from robosuite.robots.single_arm import SingleArm
+
+    if len(env.robots) != 1 or metadata.version("robosuite") != _ROBOSUITE:
+        return None
+    (robot,) = env.robots
+    controller = robot.controller
+    if (type(robot), type(controller), type(robot.gripper)) != (
+        SingleArm,
+        OperationalSpaceController,
+        PandaGripper,
+    ):
+        return None
+    plain = (
+        controller.impedance_mode == "fixed"
+        and controller.interpolator_pos is None
+        and controller.interpolator_ori is None
+        and controller.uncoupling
+        and controller.use_ori
+    )
+    spans = [
+        _span(indexes)
+        for indexes in (
+            controller.qpos_index,
+            controller.qvel_index,
+            robot._ref_joint_actuator_indexes,
+            robot._ref_joint_gripper_actuator_indexes,
+        )
+    ]
+    return OscControl(env, *spans) if plain and None not in spans else None
+
+
+class OscControl:
+    """In place of robosuite's `env._pre_action`.
+
+    After every call, controller, robot, gripper and `data.ctrl` are as after robosuite's, the buffers apart.
+
+    Args:
+        env: with the robot that `osc_control` accepts.
+        qpos: of the arm's joints.
+        qvel: of the arm's joints.
+        motors: the arm's actuators.
+        fingers: the gripper's actuators.
+    """
+
+    def __init__(self, env: LiberoEnv, qpos: slice, qvel: slice, motors: slice, fingers: slice):
+        from robosuite.utils.control_utils import nullspace_torques, opspace_matrices, orientation_error
+
+        self._nullspace_torques = nullspace_torques
+        self._opspace_matrices = opspace_matrices
+        self._orientation_error = orientation_error
+        (self._robot,) = env.robots
+        self.controller: OperationalSpaceController = self._robot.controller
+        self._gripper = self._robot.gripper
+        self._sim = env.sim
+        model, data = env.sim.model._model, env.sim.data._data
+        self._model, self._data = model, data
+        self._site = env.sim.model.site_name2id(self.controller.eef_name)
+        # MuJoCo's arrays keep their places as long as the model does: these are views.
+        self._site_pos = data.site_xpos[self._site]
+        self._site_mat = data.site_xmat[self._site].reshape(3, 3)
+        self._all_qvel = data.qvel
+        self._qpos, self._qvel, self._bias = data.qpos[qpos], data.qvel[qvel], data.qfrc_bias[qvel]
+        self._packed_mass = data.qM
+        self._motors, self._fingers = data.ctrl[motors], data.ctrl[fingers]
+        self._motor_range = model.actuator_ctrlrange[motors]
+        self._finger_range = model.actuator_ctrlrange[fingers]
+        self._full_mass = np.zeros((model.nv, model.nv))
+        self._mass = self._full_mass[qvel, qvel]
+        self._full_jac_pos, self._full_jac_ori = np.zeros((2, 3, model.nv))
+        self._jac_pos, self._jac_ori = self._full_jac_pos[:, qvel], self._full_jac_ori[:, qvel]
+        self._error, self._velocity = np.zeros(6), np.zeros(6)
+
+    def __call__(self, action: np.ndarray, policy_step: bool) -> None:
+        """Sets `data.ctrl` for the next physics step.
+
+        Args:
+            action: (7,).
+            policy_step: whether the action is a new one.
+        """
+        controller, robot = self.controller, self._robot
+        if controller.new_update:
+            self._update()
+        if policy_step:
+            self._begin(action)
+        error, velocity = self._error, self._velocity
+        np.subtract(self._goal_pos, controller.ee_pos, out=error[:3])
+        error[3:] = self._orientation_error(self._goal_ori, controller.ee_ori_mat)
+        velocity[:3], velocity[3:] = controller.ee_pos_vel, controller.ee_ori_vel
+        wanted = error * controller.kp - velocity * controller.kd
+        mass, jac = controller.mass_matrix, controller.J_full
+        _, lambda_pos, lambda_ori, nullspace = self._opspace_matrices(
+            mass, jac, controller.J_pos, controller.J_ori
+        )
+        wrench = np.concatenate([np.dot(lambda_pos, wanted[:3]), np.dot(lambda_ori, wanted[3:])])
+        torques = np.dot(jac.T, wrench) + self._bias
+        torques += self._nullspace_torques(
+            mass, nullspace, controller.initial_joint, controller.joint_pos, controller.joint_vel
+        )
+        controller.torques = torques
+        controller.new_update = True
+        robot.torques = _clip(torques, *self._motor_limits)
+        self._gripper.current_action = grip = _clip(self._gripper.current_action + self._grip_step, -1.0, 1.0)
+        self._fingers[:] = self._grip_bias + self._grip_weight * grip
+        self._motors[:] = robot.torques
+
+    def _update(self) -> None:
+        """robosuite's `Controller.update`."""
+        self._sim.forward()
+        controller = self.controller
+        controller.ee_pos, controller.ee_ori_mat = self._site_pos.copy(), self._site_mat.copy()
+        mujoco.mj_jacSite(self._model, self._data, self._full_jac_pos, self._full_jac_ori, self._site)
+        controller.ee_pos_vel = np.dot(self._full_jac_pos, self._all_qvel)
+        controller.ee_ori_vel = np.dot(self._full_jac_ori, self._all_qvel)
+        controller.joint_pos, controller.joint_vel = self._qpos.copy(), self._qvel.copy()
+        # Indexing with lists, as robosuite does, gives columns that lie together.
+        controller.J_full = jac = np.empty((6, len(self._qvel)), order="F")
+        jac[:3], jac[3:] = self._jac_pos, self._jac_ori
+        controller.J_pos, controller.J_ori = self._jac_pos.copy("F"), self._jac_ori.copy("F")
+        mujoco.mj_fullM(self._model, self._full_mass, self._packed_mass)
+        controller.mass_matrix = self._mass.copy("F")
+        controller.new_update = False
+
+    def _begin(self, action: np.ndarray) -> None:
+        """What stays as it is during a control step."""
+        controller = self.controller
+        controller.set_goal(action[:6])
+        self._goal_pos, self._goal_ori = np.array(controller.goal_pos), np.array(controller.goal_ori)
+        self._motor_limits = self._motor_range.T.copy()
+        low, high = self._finger_range.T
+        self._grip_bias, self._grip_weight = 0.5 * (high + low), 0.5 * (high - low)
+        self._grip_step = np.array([-1.0, 1.0]) * self._gripper.speed * np.sign(action[6:])
+
+
+def _clip(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
+    """`np.clip`, without its checks of what it was given."""
+    return np.minimum(np.maximum(values, low), high)
+
+
+def _span(indexes: Sequence[int]) -> slice | None:
+    """The slice of these indexes, if they follow each other."""
+    first, last = indexes[0], indexes[-1] + 1
+    return slice(first, last) if list(indexes) == list(range(first, last)) else None
