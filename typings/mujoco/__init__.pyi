@@ -25,6 +25,7 @@ class mjtJoint(IntEnum):
 
 class mjtObj(IntEnum):
     mjOBJ_CAMERA = ...
+    mjOBJ_GEOM = ...
 
 class mjtRndFlag(IntEnum):
     mjRND_SHADOW = ...
@@ -66,6 +67,7 @@ class _Visual:
     global_: _Global
 
 class MjModel:
+    actuator_ctrlrange: np.ndarray
     nbody: int
     ncam: int
     ngeom: int
@@ -127,8 +129,11 @@ class _Warning:
 
 class MjData:
     contact: _Contacts
+    ctrl: np.ndarray
     mocap_pos: np.ndarray
+    qM: np.ndarray
     qacc_warmstart: np.ndarray
+    qfrc_bias: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
     geom_xmat: np.ndarray
@@ -169,6 +174,8 @@ def mj_comPos(m: MjModel, d: MjData) -> None: ...
 def mj_forward(m: MjModel, d: MjData) -> None: ...
 def mj_forwardSkip(m: MjModel, d: MjData, skipstage: int, skipsensor: int) -> None: ...
 def mj_getState(m: MjModel, d: MjData, state: np.ndarray, spec: int) -> None: ...
+def mj_fullM(m: MjModel, dst: np.ndarray, M: np.ndarray) -> None: ...
+def mj_id2name(m: MjModel, type: int, id: int) -> str | None: ...
 def mj_jacSite(m: MjModel, d: MjData, jacp: np.ndarray, jacr: np.ndarray, site: int) -> None: ...
 def mj_kinematics(m: MjModel, d: MjData) -> None: ...
 def mj_jac(

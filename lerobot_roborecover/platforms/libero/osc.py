@@ -1,8 +1,8 @@
 """robosuite's operational-space control of LIBERO's Panda, bit for bit, without its look-ups by name.
 
 robosuite runs the controller before each of the 25 physics steps of a control step, and spends more time on
-finding out what it controls than on controlling it. Here that is found out once per controller. The floating
-point operations, their order, the compiled functions, and the memory layouts that these are given are those of
+finding out what it controls than on controlling it. Here that is found out once per controller. The operations
+on numbers, their order, the compiled functions and the memory layouts that these are given are those of
 robosuite 1.4.0 (controllers/osc.py, controllers/base_controller.py, robots/single_arm.py,
 robots/manipulator.py, models/grippers/panda_gripper.py): BLAS rounds otherwise in row than in column order.
 
@@ -52,16 +52,14 @@ def osc_control(env: LiberoEnv) -> OscControl | None:
         and controller.uncoupling
         and controller.use_ori
     )
-    spans = [
-        _span(indexes)
-        for indexes in (
-            controller.qpos_index,
-            controller.qvel_index,
-            robot._ref_joint_actuator_indexes,
-            robot._ref_joint_gripper_actuator_indexes,
-        )
-    ]
-    return OscControl(env, *spans) if plain and None not in spans else None
+    indexes = (
+        controller.qpos_index,
+        controller.qvel_index,
+        robot._ref_joint_actuator_indexes,
+        robot._ref_joint_gripper_actuator_indexes,
+    )
+    spans = [span for span in map(_span, indexes) if span is not None]
+    return OscControl(env, *spans) if plain and len(spans) == len(indexes) else None
 
 
 class OscControl:
@@ -103,7 +101,11 @@ class OscControl:
         self._mass = self._full_mass[qvel, qvel]
         self._full_jac_pos, self._full_jac_ori = np.zeros((2, 3, model.nv))
         self._jac_pos, self._jac_ori = self._full_jac_pos[:, qvel], self._full_jac_ori[:, qvel]
-        self._error, self._velocity = np.zeros(6), np.zeros(6)
+        # Position and orientation, one behind the other, as a whole and by halves.
+        self._error, self._error_pos, self._error_ori = _halves()
+        self._speed, self._speed_pos, self._speed_ori = _halves()
+        self._wanted, self._wanted_pos, self._wanted_ori = _halves()
+        self._wrench, self._wrench_pos, self._wrench_ori = _halves()
 
     def __call__(self, action: np.ndarray, policy_step: bool) -> None:
         """Sets `data.ctrl` for the next physics step.
@@ -117,17 +119,18 @@ class OscControl:
             self._update()
         if policy_step:
             self._begin(action)
-        error, velocity = self._error, self._velocity
-        np.subtract(self._goal_pos, controller.ee_pos, out=error[:3])
-        error[3:] = self._orientation_error(self._goal_ori, controller.ee_ori_mat)
-        velocity[:3], velocity[3:] = controller.ee_pos_vel, controller.ee_ori_vel
-        wanted = error * controller.kp - velocity * controller.kd
+        np.subtract(self._goal_pos, controller.ee_pos, out=self._error_pos)
+        self._error_ori[:] = self._orientation_error(self._goal_ori, controller.ee_ori_mat)
+        self._speed_pos[:], self._speed_ori[:] = controller.ee_pos_vel, controller.ee_ori_vel
+        np.subtract(self._error * controller.kp, self._speed * controller.kd, out=self._wanted)
         mass, jac = controller.mass_matrix, controller.J_full
         _, lambda_pos, lambda_ori, nullspace = self._opspace_matrices(
             mass, jac, controller.J_pos, controller.J_ori
         )
-        wrench = np.concatenate([np.dot(lambda_pos, wanted[:3]), np.dot(lambda_ori, wanted[3:])])
-        torques = np.dot(jac.T, wrench) + self._bias
+        np.dot(lambda_pos, self._wanted_pos, out=self._wrench_pos)
+        np.dot(lambda_ori, self._wanted_ori, out=self._wrench_ori)
+        torques = np.dot(jac.T, self._wrench)
+        torques += self._bias
         torques += self._nullspace_torques(
             mass, nullspace, controller.initial_joint, controller.joint_pos, controller.joint_vel
         )
@@ -164,6 +167,11 @@ class OscControl:
         low, high = self._finger_range.T
         self._grip_bias, self._grip_weight = 0.5 * (high + low), 0.5 * (high - low)
         self._grip_step = np.array([-1.0, 1.0]) * self._gripper.speed * np.sign(action[6:])
+
+
+def _halves() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    whole = np.zeros(6)
+    return whole, whole[:3], whole[3:]
 
 
 def _clip(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:

@@ -39,20 +39,54 @@ class Sim(Protocol):
         ...
 
 
+class MujocoModel(Protocol):
+    """robosuite's base of objects, fixtures, robots and grippers."""
+
+    contact_geoms: Sequence[str]
+
+
 class _Gripper(Protocol):
     current_action: np.ndarray
     """(2,) float64; (1,) or (2,) after a step."""
+    important_geoms: Mapping[str, Sequence[str]]
+    speed: float
 
 
 class OperationalSpaceController(Protocol):
     """robosuite's `OperationalSpaceController`."""
 
+    J_full: np.ndarray
+    J_ori: np.ndarray
+    J_pos: np.ndarray
     ee_ori_mat: np.ndarray
+    ee_ori_vel: np.ndarray
+    ee_pos: np.ndarray
+    ee_pos_vel: np.ndarray
+    eef_name: str
     goal_ori: np.ndarray
+    goal_pos: np.ndarray
+    impedance_mode: str
+    initial_joint: np.ndarray
+    interpolator_ori: object
+    interpolator_pos: object
+    joint_pos: np.ndarray
+    joint_vel: np.ndarray
+    kd: np.ndarray
+    kp: np.ndarray
+    mass_matrix: np.ndarray
     new_update: bool
     position_limits: Sequence[np.ndarray] | None
     """Lowest and highest corner, (3,) each."""
+    qpos_index: Sequence[int]
+    qvel_index: Sequence[int]
+    torques: np.ndarray
+    uncoupling: bool
     use_delta: bool
+    use_ori: bool
+
+    def set_goal(self, action: np.ndarray) -> None:
+        """Takes a (6,) command."""
+        ...
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         """(6,) metres and radians of a (6,) command, which it clips."""
@@ -71,8 +105,11 @@ class SingleArm(Protocol):
     eef_site_id: int
     gripper: _Gripper
     robot_model: _RobotModel
+    torques: np.ndarray
     _ref_gripper_joint_pos_indexes: list[int]
     _ref_gripper_joint_vel_indexes: list[int]
+    _ref_joint_actuator_indexes: list[int]
+    _ref_joint_gripper_actuator_indexes: list[int]
     _ref_joint_indexes: list[int]
     _ref_joint_pos_indexes: list[int]
     _ref_joint_vel_indexes: list[int]
@@ -105,6 +142,7 @@ class _Placement(Protocol):
 class LiberoEnv(Protocol):
     """hf-libero's `BDDLBaseDomain`, below its `ControlEnv`."""
 
+    check_contact: Callable[..., bool]
     control_timestep: float
     model_timestep: float
     fixtures_dict: Mapping[str, _Item]

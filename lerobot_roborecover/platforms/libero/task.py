@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.assets import package_root
+from lerobot_roborecover.platforms.libero.contacts import ContactCheck
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
 from lerobot_roborecover.platforms.libero.osc import OscControl, osc_control
@@ -113,8 +114,7 @@ class LiberoTask:
         self._used = False
         self._site_rgba: np.ndarray | None = None
         self._osc: OscControl | None = None
-        self.own_osc = True
-        """False for robosuite's own `_pre_action` where `osc.py` would do the same sooner."""
+        self.use_shortcuts(True)
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -130,6 +130,15 @@ class LiberoTask:
     def robot(self) -> SingleArm:
         """robosuite's single-arm robot."""
         return self.env.robots[0]
+
+    def use_shortcuts(self, on: bool) -> None:
+        """Whether control and contacts go by `osc.py` and `contacts.py`, as they do from the start, or by
+        robosuite's own code, which gives the same bits later. For comparisons."""
+        self._shortcuts = on
+        if on:
+            self.env.check_contact = ContactCheck(self.env)
+        else:
+            del self.env.check_contact
 
     def can_reset(self, seed: int | None) -> bool:
         """Whether `reset` can take this seed; if not, it takes an environment that was never reset."""
@@ -324,7 +333,7 @@ class LiberoTask:
         self.env.close()
 
     def _controlled(self) -> OscControl | None:
-        if not self.own_osc:
+        if not self._shortcuts:
             return None
         # robosuite makes a new controller at every reset.
         if self._osc is None or self._osc.controller is not self.robot.controller:
@@ -352,7 +361,8 @@ class LiberoTask:
         finally:
             self.env.hard_reset = False
             del self.env._initialize_sim
-        for name in ("fixture_bodies", "movable_bodies", "place_marks", "reach"):  # of the model before
+        self._osc = None  # as what follows, of the model before
+        for name in ("fixture_bodies", "movable_bodies", "place_marks", "reach"):
             self.__dict__.pop(name, None)
         return FirstReset(self.fixtures(), self.data.qacc_warmstart.copy())
 
