@@ -11,14 +11,15 @@ table of another height is no other task.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 
+from lerobot_roborecover.platforms.libero.boxes import BodyBoxes, Box
 from lerobot_roborecover.platforms.libero.goals import GOAL_KINDS, workable_order
-from lerobot_roborecover.platforms.mujoco_state import subtree
 
 if TYPE_CHECKING:
     from lerobot_roborecover.platforms.libero.task import LiberoTask
@@ -65,15 +66,6 @@ ENVIRONMENT_STATE: tuple[tuple[str, int], ...] = (
 ENVIRONMENT_STATE_DIM = sum(width for _, width in ENVIRONMENT_STATE)
 
 
-class Box(NamedTuple):
-    """Bounds along the world's axes, metres."""
-
-    centre: np.ndarray
-    """(3,) float64."""
-    half: np.ndarray
-    """(3,) float64."""
-
-
 class _Joint(NamedTuple):
     """A drawer's slide, or a door's or a knob's hinge."""
 
@@ -92,15 +84,15 @@ class GoalState:
     def __init__(self, task: LiberoTask):
         self._task, self._env, self._model = task, task.env, task.model
         self._goals = workable_order(self._env.parsed_problem["goal_state"])
-        self._geoms: dict[int, np.ndarray] = {}
         self._joints: dict[str, _Joint | None] = {}
         robot = task.robot.robot_model
         self._base = self._env.sim.model.body_name2id(robot.root_body)
-        self._others = {
-            name: body
-            for name, body in self._env.obj_body_id.items()
-            if "table" not in name and name != "floor"
-        }
+        ids = self._env.obj_body_id
+        others = [name for name in ids if "table" not in name and name != "floor"]
+        self._boxes = BodyBoxes(self._model, [*(ids[name] for name in others), *self._goal_bodies()])
+        self._others = {name: self._boxes.row[ids[name]] for name in others}
+        pads = task.robot.gripper.important_geoms
+        self._fingers = [tuple(pads["left_fingerpad"]), tuple(pads["right_fingerpad"])]
 
     def read(self, data: mujoco.MjData) -> np.ndarray:
         """The (77,) float64 numbers of `ENVIRONMENT_STATE`.
@@ -108,6 +100,7 @@ class GoalState:
         Args:
             data: kinematics at the sampling instant; goals, contacts and joints are the task's own, now.
         """
+        self._centres, self._halves = self._boxes.read(data)
         pending = [goal for goal in self._goals if not self._env._eval_predicate(goal)]
         goal, *later = pending or self._goals[-1:]
         site, base = self._task.robot.eef_site_id, data.xpos[self._base]
@@ -134,13 +127,23 @@ class GoalState:
 
     def _holds(self, goal: tuple[str, ...]) -> bool:
         held = self._env.get_object(goal[1]) if goal[1] in self._env.objects_dict else None
-        return held is not None and bool(self._env._check_grasp(self._task.robot.gripper, held))
+        # robosuite's `_check_grasp`, which asks the gripper for the names each time.
+        return held is not None and all(self._env.check_contact(pads, held) for pads in self._fingers)
+
+    def _goal_bodies(self) -> Iterator[int]:
+        """What `_box` is asked for, next to what stands about."""
+        sites, ids = self._env.object_sites_dict, self._env.obj_body_id
+        for kind, *names in self._goals:
+            places = [sites[name].parent_name if name in sites else name for name in names]
+            yield from (ids[name] for name in places if name in ids)
+            parts = [] if kind == "on" else names[-1:]
+            yield from (int(self._model.jnt_bodyid[j.id]) for j in map(self._joint, parts) if j is not None)
 
     def _item(self, data: mujoco.MjData, goal: tuple[str, ...]) -> tuple[Box, np.ndarray]:
         """Bounds and (3, 3) rotation of what is to be moved: an object, or the part on a joint."""
         joint = None if goal[0] in ("on", "in") else self._joint(goal[1])
         body = int(self._model.jnt_bodyid[joint.id]) if joint else self._env.obj_body_id[goal[1]]
-        return self._box(data, body), data.xmat[body].reshape(3, 3)
+        return self._box(body), data.xmat[body].reshape(3, 3)
 
     def _place(self, data: mujoco.MjData, goal: tuple[str, ...], item: Box, base: np.ndarray) -> np.ndarray:
         if len(goal) < 3:
@@ -159,11 +162,11 @@ class GoalState:
             parent = self._env.object_sites_dict[name].parent_name
             rim = float(place.centre[2])
             if parent in self._env.objects_dict:  # a basket, a caddy
-                box = self._box(data, self._env.obj_body_id[parent])
+                box = self._box(self._env.obj_body_id[parent])
                 rim = float(box.centre[2] + box.half[2])
             return place, rim
         body = self._env.obj_body_id[name]
-        box = self._box(data, body)
+        box = self._box(body)
         top = float(box.centre[2] + box.half[2])
         return Box(np.array([*data.xpos[body][:2], top]), box.half), top
 
@@ -172,7 +175,7 @@ class GoalState:
         if joint is None:
             return np.zeros(8)
         model, body = self._model, int(self._model.jnt_bodyid[joint.id])
-        box = self._box(data, body)
+        box = self._box(body)
         axis = data.xmat[body].reshape(3, 3) @ model.jnt_axis[joint.id]
         anchor = data.xpos[body] + data.xmat[body].reshape(3, 3) @ model.jnt_pos[joint.id]
         sign = np.sign(joint.open - joint.closed)
@@ -220,32 +223,20 @@ class GoalState:
 
     def _neighbours(self, data: mujoco.MjData, goal: tuple[str, ...], item: np.ndarray) -> np.ndarray:
         """Of the two nearest other objects and fixtures."""
-        found = []
-        for name, body in self._others.items():
-            if name != goal[1]:
-                box = self._box(data, body)
-                nearest = box.centre + np.clip(item - box.centre, -box.half, box.half) - item
-                found.append((float(np.linalg.norm(nearest)), name, nearest, box.centre - item))
-        rows = [
-            np.concatenate([[1.0], nearest, centre]) for _, _, nearest, centre in sorted(found)[:_NEIGHBOURS]
-        ]
+        centres, halves = self._centres, self._halves
+        nearest = centres + np.minimum(np.maximum(item - centres, -halves), halves) - item
+        found = sorted(
+            (math.sqrt(nearest[row].dot(nearest[row])), name, row)
+            for name, row in self._others.items()
+            if name != goal[1]
+        )
+        rows = [np.concatenate([[1.0], nearest[row], centres[row] - item]) for *_, row in found[:_NEIGHBOURS]]
         return np.concatenate([*rows, np.zeros(7 * (_NEIGHBOURS - len(rows)))])
 
-    def _box(self, data: mujoco.MjData, body: int) -> Box:
-        """Bounds of what collides of a body and its children."""
-        if body not in self._geoms:
-            inside = np.isin(self._model.geom_bodyid, list(subtree(self._model, [body])))
-            collides = self._model.geom_contype | self._model.geom_conaffinity
-            self._geoms[body] = np.flatnonzero(inside & (collides > 0))
-        geoms = self._geoms[body]
-        if not len(geoms):
-            return Box(data.xpos[body].copy(), np.zeros(3))
-        turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        local = self._model.geom_aabb[geoms]
-        centres = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, local[:, :3])
-        halves = np.einsum("gij,gj->gi", np.abs(turns), local[:, 3:])
-        low, high = (centres - halves).min(axis=0), (centres + halves).max(axis=0)
-        return Box((low + high) / 2, (high - low) / 2)
+    def _box(self, body: int) -> Box:
+        """Bounds of what collides of a body and its children, at the sampling instant."""
+        row = self._boxes.row[body]
+        return Box(self._centres[row], self._halves[row])
 
 
 def _one_hot(kind: str) -> np.ndarray:

@@ -1,10 +1,10 @@
 """robosuite's operational-space control of LIBERO's Panda, bit for bit, without its look-ups by name.
 
-robosuite runs the controller before each of the 25 physics steps of a control step, and spends more time on
-finding out what it controls than on controlling it. Here that is found out once per controller. The operations
-on numbers, their order, the compiled functions and the memory layouts that these are given are those of
-robosuite 1.4.0 (controllers/osc.py, controllers/base_controller.py, robots/single_arm.py,
-robots/manipulator.py, models/grippers/panda_gripper.py): BLAS rounds otherwise in row than in column order.
+robosuite runs the controller before each of the 25 physics steps of a control step and spends more time on
+finding out what it controls than on controlling it. Here that is found out once per controller. What is done
+with numbers, the order, the compiled functions, and the memory layouts of what these are given are those of
+robosuite 1.4.0 (osc.py and base_controller.py of controllers, single_arm.py and manipulator.py of robots,
+panda_gripper.py): BLAS rounds otherwise in row than in column order.
 
 What is left out: robosuite's `recent_*` buffers of the robot, which neither LIBERO nor its snapshots look at.
 """
@@ -12,6 +12,7 @@ What is left out: robosuite's `recent_*` buffers of the robot, which neither LIB
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,11 @@ import mujoco
 import numpy as np
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.platforms.libero.robosuite_types import LiberoEnv, OperationalSpaceController
+    from lerobot_roborecover.platforms.libero.robosuite_types import (
+        LiberoEnv,
+        OperationalSpaceController,
+        SingleArm,
+    )
 
 _ROBOSUITE = "1.4.0"
 """Whose operations these are."""
@@ -31,27 +36,10 @@ def osc_control(env: LiberoEnv) -> OscControl | None:
     Args:
         env: after a reset, which makes the controller.
     """
-    from robosuite.controllers.osc import OperationalSpaceController
-    from robosuite.models.grippers.panda_gripper import PandaGripper
-    from robosuite.robots.single_arm import SingleArm
-
-    if len(env.robots) != 1 or metadata.version("robosuite") != _ROBOSUITE:
+    if len(env.robots) != 1 or not _known(env.robots[0]):
         return None
     (robot,) = env.robots
     controller = robot.controller
-    if (type(robot), type(controller), type(robot.gripper)) != (
-        SingleArm,
-        OperationalSpaceController,
-        PandaGripper,
-    ):
-        return None
-    plain = (
-        controller.impedance_mode == "fixed"
-        and controller.interpolator_pos is None
-        and controller.interpolator_ori is None
-        and controller.uncoupling
-        and controller.use_ori
-    )
     indexes = (
         controller.qpos_index,
         controller.qvel_index,
@@ -59,7 +47,7 @@ def osc_control(env: LiberoEnv) -> OscControl | None:
         robot._ref_joint_gripper_actuator_indexes,
     )
     spans = [span for span in map(_span, indexes) if span is not None]
-    return OscControl(env, *spans) if plain and len(spans) == len(indexes) else None
+    return OscControl(env, *spans) if len(spans) == len(indexes) else None
 
 
 class OscControl:
@@ -81,13 +69,13 @@ class OscControl:
         self._nullspace_torques = nullspace_torques
         self._opspace_matrices = opspace_matrices
         self._orientation_error = orientation_error
+        self._env, self._sim = env, env.sim
         (self._robot,) = env.robots
-        self.controller: OperationalSpaceController = self._robot.controller
+        self._controller = self._robot.controller
         self._gripper = self._robot.gripper
-        self._sim = env.sim
         model, data = env.sim.model._model, env.sim.data._data
         self._model, self._data = model, data
-        self._site = env.sim.model.site_name2id(self.controller.eef_name)
+        self._site = env.sim.model.site_name2id(self._controller.eef_name)
         # MuJoCo's arrays keep their places as long as the model does: these are views.
         self._site_pos = data.site_xpos[self._site]
         self._site_mat = data.site_xmat[self._site].reshape(3, 3)
@@ -107,6 +95,12 @@ class OscControl:
         self._wanted, self._wanted_pos, self._wanted_ori = _halves()
         self._wrench, self._wrench_pos, self._wrench_ori = _halves()
 
+    @property
+    def applies(self) -> bool:
+        """Whether the robot still has this controller, with these options; robosuite makes another at every
+        reset."""
+        return self._env.robots[0].controller is self._controller and _plain(self._controller)
+
     def __call__(self, action: np.ndarray, policy_step: bool) -> None:
         """Sets `data.ctrl` for the next physics step.
 
@@ -114,7 +108,7 @@ class OscControl:
             action: (7,).
             policy_step: whether the action is a new one.
         """
-        controller, robot = self.controller, self._robot
+        controller, robot = self._controller, self._robot
         if controller.new_update:
             self._update()
         if policy_step:
@@ -144,7 +138,7 @@ class OscControl:
     def _update(self) -> None:
         """robosuite's `Controller.update`."""
         self._sim.forward()
-        controller = self.controller
+        controller = self._controller
         controller.ee_pos, controller.ee_ori_mat = self._site_pos.copy(), self._site_mat.copy()
         mujoco.mj_jacSite(self._model, self._data, self._full_jac_pos, self._full_jac_ori, self._site)
         controller.ee_pos_vel = np.dot(self._full_jac_pos, self._all_qvel)
@@ -160,7 +154,7 @@ class OscControl:
 
     def _begin(self, action: np.ndarray) -> None:
         """What stays as it is during a control step."""
-        controller = self.controller
+        controller = self._controller
         controller.set_goal(action[:6])
         self._goal_pos, self._goal_ori = np.array(controller.goal_pos), np.array(controller.goal_ori)
         self._motor_limits = self._motor_range.T.copy()
@@ -172,6 +166,31 @@ class OscControl:
 def _halves() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     whole = np.zeros(6)
     return whole, whole[:3], whole[3:]
+
+
+def _known(robot: SingleArm) -> bool:
+    from robosuite.controllers.osc import OperationalSpaceController
+    from robosuite.models.grippers.panda_gripper import PandaGripper
+    from robosuite.robots.single_arm import SingleArm
+
+    types = (type(robot), type(robot.controller), type(robot.gripper))
+    expected = (SingleArm, OperationalSpaceController, PandaGripper)
+    return types == expected and _plain(robot.controller) and _version() == _ROBOSUITE
+
+
+@cache
+def _version() -> str:
+    return metadata.version("robosuite")
+
+
+def _plain(controller: OperationalSpaceController) -> bool:
+    return (
+        controller.impedance_mode == "fixed"
+        and controller.interpolator_pos is None
+        and controller.interpolator_ori is None
+        and controller.uncoupling
+        and controller.use_ori
+    )
 
 
 def _clip(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:

@@ -138,7 +138,7 @@ class LiberoTask:
         if on:
             self.env.check_contact = ContactCheck(self.env)
         else:
-            del self.env.check_contact
+            vars(self.env).pop("check_contact", None)
 
     def can_reset(self, seed: int | None) -> bool:
         """Whether `reset` can take this seed; if not, it takes an environment that was never reset."""
@@ -335,8 +335,7 @@ class LiberoTask:
     def _controlled(self) -> OscControl | None:
         if not self._shortcuts:
             return None
-        # robosuite makes a new controller at every reset.
-        if self._osc is None or self._osc.controller is not self.robot.controller:
+        if self._osc is None or not self._osc.applies:
             self._osc = osc_control(self.env)
         return self._osc
 
