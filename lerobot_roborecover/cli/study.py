@@ -15,7 +15,8 @@ HELP = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add = parser.add_argument
-    add("--data", type=Path, help="folder of the study (default: the one that ships with the package)")
+    add("--name", default="metaworld", help="which study: one that ships with the package (%(default)s)")
+    add("--data", type=Path, help="folder of another study")
     add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
     add("--every", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
     add("--jobs", type=int, default=0, help="runs of policies at once (0: one per core)")
@@ -58,10 +59,10 @@ def run(args: argparse.Namespace) -> int:
             raise OptionError("--make makes its own data below --out; leave out --data")
         from lerobot_roborecover.study.make import make
 
-        made = make(args.out, args.stage, say=lambda line: print(line, flush=True))
+        made = make(args.name, args.out, args.stage, say=lambda line: print(line, flush=True))
         if made is None:
             return 0
-    study = read_definition(args.out / "data" if args.make else args.data or shipped_study())
+    study = read_definition(args.out / "data" if args.make else args.data or shipped_study(args.name))
     if args.print:
         todo = list(
             arms(study, args.out, scenario_ids(study, args.every) if args.every > 1 else (), args.slots)

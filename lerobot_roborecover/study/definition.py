@@ -23,7 +23,8 @@ from lerobot_roborecover.scenario import ScenarioError
 DEFINITION_FILE = "study.json"
 OUTCOMES_FILE = "outcomes.csv"
 SCHEMA_VERSION = 1
-SHIPPED = "metaworld_study"
+DEFAULT = "metaworld"
+"""The study that is meant where none is named."""
 MAX_TRIALS = 1000
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -72,9 +73,21 @@ class StudyDefinition:
         return self.root / OUTCOMES_FILE
 
 
-def shipped_study() -> Path:
-    """Folder of the study that comes with the package."""
-    return Path(str(resources.files("lerobot_roborecover"))) / "data" / SHIPPED
+def shipped_study(name: str = DEFAULT) -> Path:
+    """Folder of a study that comes with the package.
+
+    Raises:
+        ScenarioError: it does not.
+    """
+    data = Path(str(resources.files("lerobot_roborecover"))) / "data"
+    folder = data / f"{name}_study"
+    if not _NAME.fullmatch(name) or not folder.is_dir():
+        there = sorted(path.name.removesuffix("_study") for path in data.glob("*_study"))
+        raise ScenarioError(
+            f"no study {name!r:.80} comes with the package; there are {', '.join(there)}. In a checkout of "
+            "the repository, --make makes those whose recipe is in policies/study"
+        )
+    return folder
 
 
 def read_definition(root: Path) -> StudyDefinition:

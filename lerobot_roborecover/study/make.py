@@ -22,20 +22,9 @@ from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
+from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
 from lerobot_roborecover.whole import new_folder
 
-POLICIES = {"act": 1, "act_few": 1, "act_clean": 1, "diffusion": 2, "diffusion_few": 2, "tdmpc": 1}
-"""Trials of each scenario in the evaluation: one where policy and simulator are deterministic."""
-DRIVEN = {"driven1": "500-501", "driven2": "502-503"}
-"""Seeds of the scripted operator's recordings, by the chain's name for them."""
-BASE = "act"
-CHAIN, CHAIN_ROOT = Path("policies/build/metaworld_study.yaml"), "outputs/study"
-"""The scenarios' recipe, and the folder that it works in unless told otherwise."""
-INTERVENTIONS = ("reversion", "correction", "monitor_reversion", "monitor_correction")
-_ENV = {"obs_type": "state"}
-_TRAIN = "recipes.metaworld.frames_in_memory"
-"""`lerobot-train`, fed from memory: the same weights, sooner."""
-_MONITOR = Path("policies/train/monitor_small.yaml")
 _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
 
 
@@ -52,49 +41,49 @@ class StudyStage:
     """Results of an interrupted run that the commands would refuse to write over."""
 
 
-def stages(out: Path, chain: ChainConfig) -> list[StudyStage]:
-    """The stages in their order; everything lies below `out`.
+def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStage]:
+    """The stages in their order; everything that they make lies below `out`.
 
     Args:
         out: working folder.
-        chain: how the scenarios are built (`chain_for`).
+        recipe: how the study is made.
+        chain: how its scenarios are built (`chain_for`).
     """
 
     def policy(name: str) -> str:
-        return str(out / "policies" / name)
+        return str(recipe.policy(out, name))
 
     screening = [str(p.name) for p in chain.screen.policies]
     trials = out / "scenarios" / "screened.trials"
     scenarios = out / "scenarios" / "split"
-    env = [part for name, value in _ENV.items() for part in ("--env", f"{name}={value}")]
+    env = [part for name, value in recipe.env.items() for part in ("--env", f"{name}={value}")]
     logs = [str(trials / name / "trials.jsonl") for name in screening]
-    donors = [part for name in screening if name != BASE for part in ("--donor", policy(name))]
+    donors = [part for name in screening if name != recipe.base for part in ("--donor", policy(name))]
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(
             "policies",
-            (("recipes.metaworld.study_policies", "--out", str(out), "--trials", "0"),),
-            tuple(out / "policies" / name for name in POLICIES),
+            tuple(_program(words, out) for words in [recipe.train_policies] if words),
+            tuple(recipe.policy(out, name) for name in recipe.policies),
         ),
         *(
             StudyStage(
                 name,
-                (("recipes.metaworld.scripted_operator", "--out", str(out / name),
-                  "--seeds", seeds),),
+                (_program(words, out / name),),
                 (out / name / "meta" / "roborecover" / "candidates.json",),
                 (out / name, out / f"{name}.recordings"),
             )
-            for name, seeds in DRIVEN.items()
+            for name, words in recipe.recordings.items()
         ),
         StudyStage(
             "scenarios",
-            (_cli("build", str(out / CHAIN.name)),),
+            (_cli("build", str(out / Path(recipe.chain).name)),),
             (scenarios,),
         ),
         StudyStage(
             "donors",
             (_cli(
-                "donors", *logs, "--scenarios", str(scenarios), "--base", policy(BASE), *donors, *env,
+                "donors", *logs, "--scenarios", str(scenarios), "--base", policy(recipe.base), *donors, *env,
                 "--out", str(out / "donors"), "--license", "Apache-2.0",
             ),),
             (out / "donors" / "meta" / "roborecover" / "donors.json",),
@@ -103,7 +92,7 @@ def stages(out: Path, chain: ChainConfig) -> list[StudyStage]:
         StudyStage(
             "correction",
             (
-                (_TRAIN, "--config_path=policies/train/correction_act.yaml", f"--policy.path={policy(BASE)}",
+                (recipe.train, f"--config_path={recipe.correction}", f"--policy.path={policy(recipe.base)}",
                  "--dataset.repo_id=local/donors", f"--dataset.root={out / 'donors'}",
                  f"--output_dir={correction}"),
                 _cli("export-ema", str(correction / _CHECKPOINT.parent), "--out", str(out / "correction")),
@@ -123,9 +112,9 @@ def stages(out: Path, chain: ChainConfig) -> list[StudyStage]:
         ),
         StudyStage(
             "monitor",
-            ((_TRAIN, f"--config_path={_MONITOR}",
+            ((recipe.train, f"--config_path={recipe.monitor}",
               f"--dataset.root={out / 'monitor_data' / 'train'}", f"--output_dir={monitor}"),),
-            (monitor / "checkpoints" / _last_step(_MONITOR),),
+            (monitor / "checkpoints" / _last_step(Path(recipe.monitor)),),
             (monitor,),
         ),
         StudyStage(
@@ -146,23 +135,22 @@ def _last_step(config: Path) -> str:
     return f"{yaml.safe_load(config.read_text())['steps']:06d}"
 
 
-def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print) -> StudyDefinition | None:
+def make(
+    name: str, out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
+) -> StudyDefinition | None:
     """Runs what is missing and puts the study together in `out/data`; None where stages are left out.
 
     Args:
+        name: of its recipe.
         out: working folder; a rerun goes on there.
         only: names of stages; empty runs all.
         say: takes progress lines.
 
     Raises:
-        ScenarioError: a command failed, or there is no such stage.
+        ScenarioError: a command failed, or there is no such study or stage.
     """
-    if not CHAIN.is_file():
-        raise ScenarioError(
-            f"{CHAIN} is not here: a study is made in a checkout of the repository, whose top folder has the "
-            "configurations of its training and of its scenarios"
-        )
-    todo = stages(out, chain_for(out))
+    recipe = read_recipe(name)
+    todo = stages(out, recipe, chain_for(out, recipe))
     unknown = set(only) - {s.name for s in todo}
     if unknown:
         raise ScenarioError(f"no stage {sorted(unknown)}; there are {[s.name for s in todo]}")
@@ -182,28 +170,29 @@ def make(out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
         minutes = (time.monotonic() - began) / 60
         say(f"{where}: {minutes:.1f} min")
         append_records(out / "stages.jsonl", {"stage": stage.name, "minutes": round(minutes, 1)})
-    return None if only else assemble(out)
+    return None if only else assemble(out, recipe)
 
 
-def chain_for(out: Path) -> ChainConfig:
+def chain_for(out: Path, recipe: StudyRecipe) -> ChainConfig:
     """The scenarios' recipe, written anew so that it works below `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / CHAIN.name).write_text(CHAIN.read_text().replace(CHAIN_ROOT, str(out)))
-    return read_config(out / CHAIN.name)
+    chain = Path(recipe.chain)
+    (out / chain.name).write_text(chain.read_text().replace(recipe.chain_root, str(out)))
+    return read_config(out / chain.name)
 
 
-def assemble(out: Path) -> StudyDefinition:
+def assemble(out: Path, recipe: StudyRecipe) -> StudyDefinition:
     """Copies what an evaluation needs into `out/data` and writes its definition."""
     data = out / "data"
     with new_folder(data, replace=True) as folder:
-        _assemble(out, folder)
+        _assemble(out, recipe, folder)
     return read_definition(data)
 
 
-def _assemble(out: Path, folder: Path) -> None:
+def _assemble(out: Path, recipe: StudyRecipe, folder: Path) -> None:
     ignore = shutil.ignore_patterns("train_config.json", "videos", "images", "*.html")
-    for name in POLICIES:
-        shutil.copytree(out / "policies" / name, folder / "policies" / name, ignore=ignore)
+    for name in recipe.policies:
+        shutil.copytree(recipe.policy(out, name), folder / "policies" / name, ignore=ignore)
     kept = Path("meta") / "roborecover"
     shutil.copytree(out / "scenarios" / "split" / kept, folder / "scenarios" / kept, ignore=ignore)
     shutil.copytree(out / "correction", folder / "correction", ignore=ignore)
@@ -211,8 +200,8 @@ def _assemble(out: Path, folder: Path) -> None:
     for path in (*folder.glob("*/config.json"), *folder.glob("policies/*/config.json")):
         _forget_place(path)
     study = StudyDefinition(
-        root=folder, platform="metaworld", policies=POLICIES, base=BASE, env=_ENV,
-        interventions=INTERVENTIONS, environment=KERNELS,
+        root=folder, platform=recipe.platform, policies=recipe.policies, base=recipe.base, env=recipe.env,
+        interventions=tuple(recipe.interventions), environment=KERNELS,
     )  # fmt: skip
     write_definition(study)
 
@@ -222,6 +211,11 @@ def _forget_place(path: Path) -> None:
     config = json.loads(path.read_text())
     if config.get("pretrained_path"):
         path.write_text(json.dumps({**config, "pretrained_path": None}, indent=4))
+
+
+def _program(words: Sequence[str], out: Path) -> tuple[str, ...]:
+    module, *rest = words
+    return (module, "--out", str(out), *rest)
 
 
 def _cli(*argv: str) -> tuple[str, ...]:

@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
 from lerobot_roborecover.study.definition import read_definition
 from lerobot_roborecover.study.evaluate import compare_with_stored
-from lerobot_roborecover.study.make import POLICIES, chain_for, stages
+from lerobot_roborecover.study.make import chain_for, stages
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
+from lerobot_roborecover.study.recipe import read_recipe
 from tests.support.factories import fake_dataset, save_policy
 
 COUNT = 4
@@ -174,11 +176,51 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path,
     assert "Run the same command again" in message
 
 
+def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
+    recipe = read_recipe("libero")
+    policies, *_, metrics = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
+    assert policies.commands == ()
+    assert all(path.is_dir() for path in policies.done)
+    assert metrics.name == "monitor metrics"
+    chain = chain_for(tmp_path, recipe)
+    recorded = {part.dataset for part in chain.collect.values() if part.dataset}
+    assert recorded == {str(tmp_path / name) for name in recipe.recordings}, (
+        "the chain takes what is recorded"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("policies_folder: there\ntrain_policies: [a]", "not both"),
+        ("", "not neither"),
+        ("policies_folder: there\nbase: diffusion", "base 'diffusion' is not one of act"),
+        ("policies_folder: there\npolicy: act", "policy"),
+    ],
+)
+def test_a_recipe_that_makes_no_sense_is_refused(tmp_path, monkeypatch, text, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "policies" / "study").mkdir(parents=True)
+    head = {"platform": "fake", "base": "act", "policies": "{act: 1}", "chain": "c", "chain_root": "r"}
+    lines = [f"{k}: {v}" for k, v in head.items() if f"\n{k}:" not in text]
+    (tmp_path / "policies" / "study" / "mine.yaml").write_text("\n".join([*lines, text]))
+    with pytest.raises(OptionError, match=said):
+        read_recipe("mine")
+    with pytest.raises(ScenarioError, match="there are mine"):
+        read_recipe("other")
+
+
+def test_a_study_that_does_not_ship_is_named(capsys):
+    assert main(["study", "--name", "robotwin"]) == 2
+    assert "no study 'robotwin' comes with the package; there are metaworld" in capsys.readouterr().err
+
+
 def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
-    found = stages(tmp_path, chain_for(tmp_path))
+    recipe = read_recipe("metaworld")
+    found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
     assert [s.name for s in found] == [
         "policies", "driven1", "driven2", "scenarios", "donors", "correction", "monitor data", "monitor",
         "monitor metrics",
     ]  # fmt: skip
     assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
-    assert {path.name for path in found[0].done} == set(POLICIES), "none of them is forgotten"
+    assert {path.name for path in found[0].done} == set(recipe.policies), "none of them is forgotten"

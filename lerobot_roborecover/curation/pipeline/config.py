@@ -173,6 +173,20 @@ def read_config(path: Path) -> ChainConfig:
     Raises:
         OptionError: names the file, the key and what it may be.
     """
+    config = read_options(ChainConfig, path)
+    try:
+        _check(config)
+    except OptionError as err:
+        raise OptionError(f"{path}: {err}") from None
+    return config
+
+
+def read_options[Options](kind: type[Options], path: Path) -> Options:
+    """Reads a YAML file of options into their dataclass.
+
+    Raises:
+        OptionError: names the file, the key and what it may be.
+    """
     import draccus
     import yaml
 
@@ -185,14 +199,12 @@ def read_config(path: Path) -> ChainConfig:
     if not isinstance(content, dict):
         raise OptionError(f"{path} holds a {type(content).__name__}, not a map of options")
     try:
-        check_keys(ChainConfig, content, "")
-        config = draccus.decode(ChainConfig, content)
-        _check(config)
+        check_keys(kind, content, "")
+        return draccus.decode(kind, content)
     except OptionError as err:
         raise OptionError(f"{path}: {err}") from None
     except (draccus.utils.DecodingError, draccus.utils.ParsingError, ValueError, TypeError) as err:
         raise OptionError(f"{path}: {' '.join(str(err).split())}") from None
-    return config
 
 
 def check_keys(kind: Any, content: Any, where: str) -> None:
