@@ -20,6 +20,7 @@ COMMANDS = (
     "check-policy",
     "plan",
     "eval",
+    "reproduce",
     "merge",
     "report",
     "compare",

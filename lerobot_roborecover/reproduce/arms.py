@@ -1,0 +1,220 @@
+"""The two runs of a reproduction: each goes on where it was, and the second waits for what the first says."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lerobot_roborecover.analysis.agreement import Agreement, Standing, agreement
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.summary import StartSummary, summarise
+from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
+from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
+from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
+from lerobot_roborecover.scenario import ScenarioError, Start
+from lerobot_roborecover.study.child import run_module
+from lerobot_roborecover.whole import write_whole
+
+INITIAL, RECOVERY = str(Start.INITIAL), str(Start.RECOVERY)
+_TAKEN = ("--env.start", "--env.trial_log", "--output_dir", "--eval.n_episodes", "--config_path")
+_SET = ("scenarios", "revision", "split", "select")
+
+
+@dataclass(frozen=True)
+class ReproductionPlan:
+    """Who is reproduced, on what, and how often."""
+
+    checkpoint: PublishedCheckpoint
+    out: Path
+    trials: int = 5
+    """Per scenario and arm."""
+    arguments: tuple[str, ...] = ()
+    """For `roborecover eval`, in both arms; they win over the configuration."""
+    published: PublishedScore | None = None
+    """What the initial arm is held against; None where nothing is published."""
+    margin: float = 0.10
+    anyway: bool = False
+    """Run the recovery arm whatever the initial arm says."""
+    costs: Costs = field(default_factory=Costs)
+
+    def __post_init__(self):
+        if self.trials < 1:
+            raise OptionError(f"--trials={self.trials}: at least 1")
+        if not 0 < self.margin < 1:
+            raise OptionError(f"--margin={100 * self.margin:g}: points, above 0 and below 100")
+        for argument in self.arguments:
+            name, equals, _ = argument.partition("=")
+            if name in _TAKEN:
+                raise OptionError(f"{name} is set by this command itself")
+            if not equals or not name.strip("-"):
+                raise OptionError(f"--set {argument.lstrip('-')}: an option of roborecover eval, NAME=VALUE")
+
+    def folder(self, start: str) -> Path:
+        """Of an arm's results."""
+        return self.out / start
+
+    def log(self, start: str) -> Path:
+        """Trial log of an arm."""
+        return self.folder(start) / "trials.jsonl"
+
+    def argv(self, start: str) -> list[str]:
+        """Arguments of `roborecover` that run an arm."""
+        return [
+            "eval", f"--config_path={self.checkpoint.config}", *self.checkpoint.arguments, *self.arguments,
+            f"--env.start={start}", f"--env.trial_log={self.log(start)}",
+            f"--eval.n_episodes={self.trials}", f"--output_dir={self.folder(start)}",
+        ]  # fmt: skip
+
+    def command_line(self, start: str) -> str:
+        """The same to copy."""
+        return shlex.join(["roborecover", *self.argv(start)])
+
+    def option(self, name: str) -> str | None:
+        """Value of an option `--NAME=VALUE`: the last one given, else the configuration's."""
+        value = _dig(yaml.safe_load(self.checkpoint.config.read_text()) or {}, name.split("."))
+        for argument in (*self.checkpoint.arguments, *self.arguments):
+            key, _, given = argument.removeprefix("--").partition("=")
+            if key == name:
+                value = given
+        return None if value is None else str(value)
+
+    def scenarios(self) -> ScenarioSet:
+        """The scenarios that both arms are run on.
+
+        Raises:
+            OptionError: nothing says which.
+            ScenarioError: they cannot be loaded.
+        """
+        found = {name: self.option(f"env.{name}") or "" for name in _SET}
+        kind = (self.option("env.type") or "").removeprefix(ENV_PREFIX)
+        source = found["scenarios"] or (platform_named(kind).default_scenarios if kind else "")
+        if not source:
+            raise OptionError(
+                f"{self.checkpoint.config}: no scenario set. Give one: --scenarios FOLDER_OR_HUB_ID"
+            )
+        return load_scenarios(
+            source, revision=found["revision"] or None, split=found["split"] or None, select=found["select"]
+        )
+
+    def length(self, start: str, scenarios: ScenarioSet) -> RunLength:
+        """What an arm should take at most."""
+        executed = int(self.option("policy.n_action_steps") or 1)
+        return run_length(list(scenarios), self.trials, executed, self.costs, replay=start == RECOVERY)
+
+
+@dataclass(frozen=True)
+class ArmResult:
+    """An arm that has been run."""
+
+    start: str
+    rows: tuple[TrialRow, ...]
+    summary: StartSummary
+    seconds: float
+    """Of wall time, over all its runs."""
+
+
+@dataclass(frozen=True)
+class ReproductionResult:
+    """What came of it."""
+
+    plan: ReproductionPlan
+    scenarios: int
+    initial: ArmResult
+    check: Agreement
+    """The initial arm beside the published score."""
+    makers: tuple[PublishedScore, Agreement] | None
+    recovery: ArmResult | None
+    """None where the initial arm is below what is published."""
+    against_paper: Agreement | None
+    """The recovery arm beside the paper's."""
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the initial arm shows that the policy is set up as its score says."""
+        return self.check.standing in (Standing.AGREES, Standing.HIGHER)
+
+
+def run_arms(plan: ReproductionPlan, say: Callable[[str], None] = print) -> ReproductionResult:
+    """Runs what is not done yet.
+
+    Args:
+        plan: what.
+        say: takes progress lines; the runs themselves write to the terminal.
+
+    Raises:
+        ScenarioError: a run failed; the same command goes on where it was.
+    """
+    scenarios = plan.scenarios()
+    initial = _run(plan, INITIAL, scenarios, say)
+    rate = initial.summary.rsr
+    check = agreement(rate, plan.published.rate if plan.published else None, plan.margin)
+    makers = plan.checkpoint.of_makers(list(scenarios))
+    beside = None if makers is None else (makers, agreement(rate, makers.rate, plan.margin))
+    recovery = None
+    if check.standing is not Standing.LOWER or plan.anyway:
+        recovery = _run(plan, RECOVERY, scenarios, say)
+    against = None
+    if recovery is not None:
+        against = agreement(recovery.summary.rsr, plan.checkpoint.recovery, plan.margin)
+    return ReproductionResult(plan, len(scenarios), initial, check, beside, recovery, against)
+
+
+def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callable[[str], None]) -> ArmResult:
+    folder, log = plan.folder(start), plan.log(start)
+    done, argv = folder / "done.json", plan.argv(start)
+    length = plan.length(start, scenarios)
+    record: dict[str, Any] = json.loads(done.read_text()) if done.is_file() else {}
+    if not (record.get("finished") and record.get("argv") == argv):
+        say(f"{start}: {length.trials} trials, at most {length.hours:.2g} hours. {plan.command_line(start)}")
+        folder.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        # Checkpoints and scenario sets come from the Hub, unless the caller is offline.
+        online = {"HF_HUB_OFFLINE": os.environ.get("HF_HUB_OFFLINE", "0")}
+        status = run_module("lerobot_roborecover.cli.main", argv, online)
+        seconds = record.get("seconds", 0.0) + time.monotonic() - began
+        write_whole(done, json.dumps({"argv": argv, "seconds": seconds, "finished": status == 0}))
+        record = {"seconds": seconds}
+        if status:
+            raise ScenarioError(
+                f"the {start} arm ended with status {status}; what it said is above. The same command goes "
+                f"on with what is left ({log})"
+            )
+    ids = {s.id for s in scenarios}
+    rows = [r for r in read_trial_log(log) if r.scenario_id in ids and r.trial < plan.trials]
+    found = summarise([asdict(row) for row in rows], plan.trials).starts[Start(start)]
+    return ArmResult(start, tuple(rows), found, record["seconds"])
+
+
+def published_score(text: str) -> PublishedScore:
+    """A published rate as it is given on the command line, in per cent: `94.2`, or `94.2,91.5,96.5`.
+
+    Raises:
+        OptionError: these are no such numbers.
+    """
+    try:
+        numbers = [float(part) / 100 for part in text.split(",")]
+        value, low, high = numbers if len(numbers) > 1 else (*numbers, float("nan"), float("nan"))
+    except ValueError:
+        raise OptionError(f"--published={text}: RATE or RATE,LOW,HIGH in per cent") from None
+    if not 0 <= value <= 1 or (len(numbers) > 1 and not 0 <= low <= value <= high <= 1):
+        raise OptionError(f"--published={text}: per cent, 0 <= LOW <= RATE <= HIGH <= 100")
+    return PublishedScore(Estimate(value, low, high), "as given", "--published")
+
+
+def _dig(config: Mapping[str, Any], keys: list[str]) -> Any:
+    value: Any = config
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
