@@ -29,7 +29,7 @@ class Standing(StrEnum):
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ScoreAgreement:
     """A measured rate beside a published one; rates in [0, 1]."""
 
     measured: Estimate
@@ -40,7 +40,7 @@ class Agreement:
     standing: Standing
 
 
-def agreement(measured: Estimate, published: Estimate | None, margin: float = MARGIN) -> Agreement:
+def agreement(measured: Estimate, published: Estimate | None, margin: float = MARGIN) -> ScoreAgreement:
     """Compares two rates from different trials by the interval of their difference.
 
     The interval is put together from the two rates' own (MOVER: Newcombe 1998, method 10; Donner and Zou
@@ -53,7 +53,7 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
     """
     nothing = Estimate(math.nan, math.nan, math.nan)
     if published is None or math.isnan(measured.low):
-        return Agreement(measured, published or nothing, nothing, Standing.UNPUBLISHED)
+        return ScoreAgreement(measured, published or nothing, nothing, Standing.UNPUBLISHED)
     low, high = (_or(bound, published.value) for bound in (published.low, published.high))
     value = measured.value - published.value
     difference = Estimate(
@@ -67,7 +67,7 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
         standing = Standing.HIGHER
     else:
         standing = Standing.AGREES if difference.low > -margin else Standing.UNDECIDED
-    return Agreement(measured, published, difference, standing)
+    return ScoreAgreement(measured, published, difference, standing)
 
 
 def mixed_rate(rates: Sequence[float], shares: Sequence[float], episodes: int | None) -> Estimate:

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from lerobot_roborecover.analysis.agreement import Agreement, Standing, agreement
+from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing, agreement
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
@@ -132,12 +132,12 @@ class ReproductionResult:
     plan: ReproductionPlan
     scenarios: int
     initial: ArmResult
-    check: Agreement
+    check: ScoreAgreement
     """The initial arm beside the published score."""
-    makers: tuple[PublishedScore, Agreement] | None
+    makers: tuple[PublishedScore, ScoreAgreement] | None
     recovery: ArmResult | None
     """None where the initial arm is below what is published."""
-    against_paper: Agreement | None
+    against_paper: ScoreAgreement | None
     """The recovery arm beside the paper's."""
 
     @property

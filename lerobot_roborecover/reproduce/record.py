@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.analysis.agreement import Agreement, Standing
+from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_markdown
 from lerobot_roborecover.env.render_device import egl_devices
@@ -107,7 +107,7 @@ def machine() -> str:
 
 
 def _scores(result: ReproductionResult) -> Table:
-    compared: list[tuple[str, str, Agreement]] = []
+    compared: list[tuple[str, str, ScoreAgreement]] = []
     if result.plan.published is not None:
         published = result.plan.published
         compared += [("initial states", f"{published.source}; {published.on}", result.check)]
@@ -162,7 +162,7 @@ def _arm(result: ReproductionResult, arm: ArmResult) -> dict[str, Any]:
     }
 
 
-def _compared(found: Agreement) -> dict[str, Any]:
+def _compared(found: ScoreAgreement) -> dict[str, Any]:
     return {**asdict(found), "standing": str(found.standing)}
 
 
