@@ -94,10 +94,10 @@ def test_a_run_that_fails_says_how_to_go_on(reproduce, capfd):
 
 
 def test_what_would_be_run(reproduce, config, capsys):
-    assert reproduce("--print", "--inference-ms", "3600000", "--batch", "1")[0] == 0
+    assert reproduce("--print", "--inference-ms", "900000", "--batch", "1")[0] == 0
     out = capsys.readouterr().out.splitlines()
-    # 4 scenarios, 2 trials, 12 steps, 2 actions an inference of an hour.
-    assert out[0].startswith(f"# initial: {COUNT * TRIALS} trials, at most 48 hours")
+    # 4 scenarios, 2 trials, 12 steps, 2 actions an inference of a quarter of an hour.
+    assert out[0].startswith(f"# initial: {COUNT * TRIALS} trials, at most 12 hours")
     assert "--env.start=recovery" in out[3]
     assert "--runner.slots=1" in out[3]
 
@@ -113,12 +113,17 @@ def test_what_would_be_run(reproduce, config, capsys):
         (["pi05_libero", "--set", "cuda"], "NAME=VALUE"),
         (["pi05_libero", "--published", "x"], "RATE,LOW,HIGH"),
         (["pi05_libero", "--print", "--slots", "0"], "slots=0"),
-        (["pi05_robotwin", "--print"], "no scenario set"),
     ],
 )
 def test_refusals(arguments, said, capsys):
     assert main(["reproduce", *arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_configuration_without_scenarios_is_refused(tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("policy: {path: x}\n")
+    assert main(["reproduce", str(tmp_path / "mine.yaml"), "--print"]) == 2
+    assert "no scenario set" in capsys.readouterr().err
 
 
 def test_a_configuration_that_is_not_installed_is_said(monkeypatch, tmp_path, capsys):
