@@ -14,6 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, TrialRow, read_log
@@ -117,6 +118,11 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
         if name and len(log.policies) > 1:
             raise RowsError(
                 f"{path} holds {len(log.policies)} policies ({', '.join(log.policies)}): no one NAME fits"
+            )
+        if any(FORK in row.options for row in log.rows):
+            raise RowsError(
+                f"{path} holds forks of other trials, which say nothing of a policy at the recovery point: "
+                "the page beside it says what they gain (roborecover fork)"
             )
         for row in log.rows:
             other = rows.setdefault((row.policy, run or 0, *row.key()), row)

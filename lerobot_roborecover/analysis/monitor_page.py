@@ -215,7 +215,7 @@ def write_monitor_report(
     }
     (out / "metrics.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
     page = render_page(
-        "monitor.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
+        "tables_figures.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
     )
     (out / "monitor.html").write_text(page, encoding="utf-8")
     return out / "monitor.html"

@@ -34,6 +34,8 @@ class Metric:
     percentile bootstrap's."""
     about: str
     """A sentence for those who read the table."""
+    optional: bool = False
+    """Left out of tables where no trial has a value."""
 
 
 def _horizon_used(row: TrialRow) -> float:
@@ -44,6 +46,26 @@ def _steps_to_recover(row: TrialRow) -> float:
     return float(row.steps) if row.success else NONE
 
 
+def _best_progress(row: TrialRow) -> float:
+    return max(row.progress) / 100 if row.progress else NONE
+
+
+def _drawdown(row: TrialRow) -> float:
+    """Largest fall below the best so far."""
+    if not row.progress:
+        return NONE
+    shares = np.asarray(row.progress) / 100
+    return float((np.maximum.accumulate(shares) - shares).max())
+
+
+def _steps_to_lasting_progress(row: TrialRow) -> float:
+    """First step from which on it never is as far from the goal again as at the handoff."""
+    if not row.progress or row.progress[-1] <= row.progress[0]:
+        return NONE
+    back = np.flatnonzero(np.asarray(row.progress) <= row.progress[0])
+    return float(back[-1] + 1)
+
+
 METRICS = (
     Metric("Horizon used %", _horizon_used, True, "Horizon used: new steps over the scenario's horizon."),
     Metric(
@@ -51,6 +73,29 @@ METRICS = (
         _steps_to_recover,
         False,
         "Steps to recover: new steps of successful trials.",
+    ),
+    Metric(
+        "Best progress %",
+        _best_progress,
+        True,
+        "Best progress: the most of the task that was done at any step, failures included (partial credit; "
+        "docs/report.md says what a platform takes for progress).",
+        optional=True,
+    ),
+    Metric(
+        "Drawdown %",
+        _drawdown,
+        True,
+        "Drawdown: the largest fall of progress below the best that the trial had reached by then.",
+        optional=True,
+    ),
+    Metric(
+        "Steps to lasting progress",
+        _steps_to_lasting_progress,
+        False,
+        "Steps to lasting progress: new steps until progress is above that of the handoff for good; trials "
+        "that end no further than they began are left out.",
+        optional=True,
     ),
 )
 """Columns, in this order."""
@@ -80,6 +125,7 @@ def metric_estimates(panel: Panel, metric: Metric, draws: Resampling) -> list[Es
 
 def trial_metrics(panel: Panel, draws: Resampling, metrics: tuple[Metric, ...] = METRICS) -> Table:
     """Every policy's mean of every metric."""
+    metrics = tuple(m for m in metrics if not (m.optional and np.isnan(scenario_means(panel, m)).all()))
     columns = [metric_estimates(panel, metric, draws) for metric in metrics]
     return Table(
         "trial_metrics",

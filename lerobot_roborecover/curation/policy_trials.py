@@ -17,19 +17,18 @@ import numpy as np
 
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial import Trial, actions_digest
+from lerobot_roborecover.env.trial import Trial
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions, read_actions
 from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log, trial_key
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.local import LocalEngine
-from lerobot_roborecover.whole import new_file
 
 if TYPE_CHECKING:
     from lerobot_roborecover.env.configs import RecoveryEnvConfig
 
 TRIALS_FILE = "trials.jsonl"
-ACTIONS_FOLDER = "actions"
 
 
 @dataclass(frozen=True)
@@ -158,26 +157,8 @@ def _keep_actions(folder: Path, trial: Trial, row: TrialRow) -> None:
             f"{row.steps} steps: it went back in time, and cannot be replayed as one run. Run its base "
             "policy"
         )
-    with new_file(actions_path(folder, row)) as path, open(path, "wb") as file:
-        np.save(file, actions, allow_pickle=False)
-
-
-def actions_path(folder: Path, row: TrialRow) -> Path:
-    """File of a trial's actions, by their own hash."""
-    return folder / f"{row.actions_sha256}.npy"
+    keep_actions(folder, trial, row)
 
 
 def _with_actions(row: TrialRow, folder: Path) -> PolicyTrial:
-    if not row.steps:
-        return PolicyTrial(row, np.zeros((0, 0), np.float32))
-    path = actions_path(folder, row)
-    try:
-        actions = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as err:
-        raise ScenarioError(
-            f"trial {row.trial} of {row.scenario_id} by {row.policy}: its actions cannot be read ({err}). A "
-            f"log alone cannot be replayed; keep {folder} beside it, or run the policy again in a new folder"
-        ) from None
-    if actions.ndim != 2 or len(actions) != row.steps or actions_digest(actions) != row.actions_sha256:
-        raise ScenarioError(f"{path} does not hold the actions of trial {row.trial} of {row.scenario_id}")
-    return PolicyTrial(row, actions)
+    return PolicyTrial(row, read_actions(folder, row))

@@ -88,7 +88,7 @@ class Episode:
     scenario_index: int
     instruction: str
     columns: Mapping[str, np.ndarray]
-    """Columns of its own, (T,) float32 each."""
+    """Columns of its own, (T,) each: bool, or numbers that are written as float32."""
 
 
 def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int], name: str) -> None:
@@ -122,6 +122,10 @@ def quiet_video() -> None:
     av.logging.set_libav_level(av.logging.ERROR)
 
 
+def _dtype(column: np.ndarray) -> str:
+    return "bool" if np.asarray(column).dtype == bool else "float32"
+
+
 class EpisodeWriter:
     """Writes episodes as a LeRobotDataset in a folder that does not exist yet.
 
@@ -152,7 +156,7 @@ class EpisodeWriter:
             if dataset is None:
                 dataset = self._dataset = self._create(episode, frame)
             action = episode.actions[written]
-            own = {k: np.array([v[written]], dtype=np.float32) for k, v in episode.columns.items()}
+            own = {k: np.array([v[written]], dtype=_dtype(v)) for k, v in episode.columns.items()}
             dataset.add_frame(
                 {
                     **frame,
@@ -175,7 +179,9 @@ class EpisodeWriter:
 
     def _create(self, episode: Episode, frame: Frame) -> LeRobotDataset:
         features = features_of(frame, episode.actions.shape[1])
-        features |= {k: {"dtype": "float32", "shape": (1,), "names": None} for k in episode.columns}
+        features |= {
+            k: {"dtype": _dtype(v), "shape": (1,), "names": None} for k, v in episode.columns.items()
+        }
         dataset = LeRobotDataset.create(
             repo_id=f"roborecover/{self._root.name.strip('.')}",
             fps=self._fps,

@@ -24,7 +24,7 @@ from lerobot_roborecover.scenario import Reset, ScenarioError, Task
 
 TRAJECTORIES_FILE = "trajectories.json"
 SCHEMA_VERSION = 1
-KINDS = ("donors", "monitor", "rollouts")
+KINDS = ("donors", "monitor", "rollouts", "training")
 LABEL = "next.reward"
 """(1,) float32: the monitor's label of the frame. LeRobot hands this column, and no other of ours, to a
 reward model."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
@@ -62,6 +62,8 @@ class Trajectory:
     not_replayable: str = ""
     """Why it cannot be replayed exactly; empty where it can."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Further columns by name, (T,) bool or float32."""
 
 
 def split_by_scenario(
@@ -95,17 +97,19 @@ def write_trajectories(
     splits: Mapping[str, str] | None = None,
     description: str = "",
     license: str | None = None,
+    also: Callable[[Path], object] = lambda folder: None,
 ) -> Path:
     """Writes a trajectory dataset; it appears as a whole, or not at all.
 
     Args:
         root: the dataset's folder; must be new or empty.
-        kind: `donors`, `monitor` or `rollouts`.
+        kind: one of `KINDS`.
         trajectories: of one platform; drawn one at a time, so that a generator need not hold them all.
         fps: frame rate: the platform's control rate.
         splits: split by scenario id, where it is not the scenarios' own (`split_by_scenario`).
         description: free text.
         license: SPDX identifier, or None where none is decided.
+        also: writes further files into the folder before it appears.
 
     Raises:
         ScenarioError: a trajectory does not fit the kind or the others, or there is none.
@@ -116,6 +120,7 @@ def write_trajectories(
     with new_folder(root) as folder:
         links, rows, labels = _write_episodes(folder, kind, trajectories, fps, splits or {})
         write_metadata(folder, kind, links, rows, labels=labels, description=description, license=license)
+        also(folder)
     return root
 
 
@@ -145,6 +150,9 @@ def _write_episodes(
                     )
                 index = list(links).index(scenario.id)
                 labels.update((link.split, int(v)) for v in trajectory.labels or ())
+            wrong = {k for k, v in trajectory.columns.items() if np.shape(v) != (len(trajectory.actions),)}
+            if wrong:
+                raise ScenarioError(f"trajectory {number}: column {min(wrong)} has not one value a step")
             writer.write(
                 Episode(
                     f"trajectory {number}",
@@ -152,7 +160,9 @@ def _write_episodes(
                     trajectory.frames,
                     index,
                     trajectory.task.instruction,
-                    {LABEL: np.asarray(trajectory.labels)} if trajectory.labels is not None else {},
+                    {LABEL: np.asarray(trajectory.labels)}
+                    if trajectory.labels is not None
+                    else trajectory.columns,
                 )
             )
             rows.append(_row(trajectory, index))

@@ -85,6 +85,10 @@ class InterventionRecord:
             "seconds": round(result.seconds, 4),
         }
 
+    def add(self, entry: dict[str, Any]) -> None:
+        """Takes in what was done to the trial from outside; has at least `kind` and `step`."""
+        self._entries.append(entry)
+
     def budget(self, horizon: int) -> int:
         """Steps after which the trial ends: S, and as many as were undone."""
         return horizon + self.undone

@@ -49,6 +49,9 @@ class RecoveryOptions:
     """Longest a simulator may take over one command before its worker is replaced, seconds."""
     snapshot_dir: str = ""
     """Folder that keeps handoff snapshots between runs; empty shares them within the run alone."""
+    record_actions: bool = False
+    """Keep what was executed in every trial, in the folder `actions` beside the trial log: what forks and
+    training data are made from."""
     videos: bool = False
     """Render frames for LeRobot's videos also where the observation has no pixels."""
     realtime: bool = False

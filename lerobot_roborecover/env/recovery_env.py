@@ -15,6 +15,8 @@ import numpy as np
 
 from lerobot_roborecover.env.directives import BY_RULE
 from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator, platform_named
+from lerobot_roborecover.platforms.simulator import ShowsProgress
+from lerobot_roborecover.platforms.walk import advance
 from lerobot_roborecover.replay import Handoff, hand_off
 from lerobot_roborecover.rewind import Trail
 from lerobot_roborecover.scenario import Start, TrialStart
@@ -39,6 +41,8 @@ class RecoveryEnv(gym.Env):
         cache: handoff snapshots to use and to fill; by default one of this env's own.
         control_mode: how actions after the handoff are read, for simulators that have more than one way.
         rollback_steps: how far back `rollback` should be fast; it works without.
+        played: (n, A) actions that a reset executes after the handoff, in their own type.
+        spent: new steps that count as taken after a reset.
         render_mode: only `rgb_array`.
         options: keyword options of the simulator.
 
@@ -58,6 +62,8 @@ class RecoveryEnv(gym.Env):
         cache: SnapshotCache | None = None,
         control_mode: str | None = None,
         rollback_steps: int = 0,
+        played: np.ndarray | None = None,
+        spent: int = 0,
         render_mode: str = "rgb_array",
         **options: Any,
     ):
@@ -75,6 +81,7 @@ class RecoveryEnv(gym.Env):
         self._cache = cache if cache is not None else SnapshotCache()
         self._control_mode = control_mode
         self._rollback_steps = rollback_steps
+        self._played, self._spent = played, spent
         self._trail: Trail | None = None
         self.metadata = {**self.metadata, "render_fps": int(self._simulator.control_hz)}
         self.observation_space = self._simulator.observation_space
@@ -91,7 +98,7 @@ class RecoveryEnv(gym.Env):
         """Rebuilds the handoff. The scenario fixes its own reset: `seed` changes nothing in the
         simulation."""
         super().reset(seed=seed)
-        self._steps = self._undone = 0
+        self._steps, self._undone = self._spent, 0
         self.handoff = hand_off(
             self._simulator,
             self.scenario,
@@ -108,6 +115,8 @@ class RecoveryEnv(gym.Env):
             cache=self._cache,
             control_mode=self._control_mode,
         )
+        if self._played is not None and self.handoff.problem is None:
+            advance(self._trail, self._played)
         return self._simulator.observe(), {"is_success": False, "handoff": asdict(self.handoff)}
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
@@ -139,6 +148,10 @@ class RecoveryEnv(gym.Env):
         self._steps += 1
         return self._simulator.succeeded()
 
+    def progress(self) -> float | None:
+        """How much of the task is done, from 0 to 1; None where the simulator does not tell."""
+        return self._simulator.progress() if isinstance(self._simulator, ShowsProgress) else None
+
     def rollback(self, steps: int) -> RollbackResult:
         """Puts the simulation back to the exact state that it had some steps ago.
 
@@ -157,7 +170,10 @@ class RecoveryEnv(gym.Env):
         solved = self._simulator.succeeded()
         observation = self._simulator.observe()
         seconds = time.perf_counter() - began
-        return RollbackResult(observation, rewound.distance, rewound.undone, rewound.method, seconds, solved)
+        return RollbackResult(
+            observation, rewound.distance, rewound.undone, rewound.method, seconds, solved,
+            progress=self.progress(),
+        )  # fmt: skip
 
     def _running(self) -> Trail:
         if self.handoff is None or self._trail is None:

@@ -8,6 +8,7 @@ import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.real_time import RealTime
 from lerobot_roborecover.env.trial import Trial
-from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow, check_retry
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions
+from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow, check_retry, trial_key
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.robot_fingerprint import (
     NAME,
@@ -112,6 +114,11 @@ class Run:
         """The log's rows of this run's protocol."""
         config_hash = self.protocol.config_hash()
         return [] if self.log is None else [r for r in self.log.rows if r.config_hash == config_hash]
+
+    def keys(self, trials: Sequence[tuple[TrialStart, int]]) -> list[tuple]:
+        """What the log knows trials by: scenarios, and k."""
+        hash_ = self.protocol.config_hash()
+        return [trial_key(scenario.sha256(), scenario.id, hash_, k) for scenario, k in trials]
 
     def trial(self, scenario: TrialStart, index: int, protocol: Protocol | None = None) -> Trial:
         """A trial of the run, not begun.
@@ -217,6 +224,8 @@ def open_run(
         intervention=facts.intervention,
         real_time=real_time,
     )
+    if options.record_actions:
+        run.keep = partial(keep_actions, log.path.with_name(ACTIONS_FOLDER))
     return scenarios, run
 
 

@@ -47,7 +47,8 @@ class SlotServer:
         if command == "step":
             began = time.perf_counter()
             observation, _, success, _, _ = self._env.step(argument)
-            return StepResult(observation, success, time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+            return StepResult(observation, success, seconds, self._env.progress())
         if command == "act":
             return self._act(argument)
         if command == "rollback":
@@ -69,12 +70,15 @@ class SlotServer:
             cache=self._cache,
             control_mode=self._config.control_mode,
             rollback_steps=spec.rollback_steps,
+            played=spec.played,
+            spent=spec.spent,
         )
         observation, _ = self._env.reset()
         assert self._env.handoff is not None
         self._filmed = spec.filmed
         frame = self._env.render() if spec.filmed else None
-        return EpisodeStart(observation, self._env.handoff, frame, self._simulator.control_hz)
+        hz = self._simulator.control_hz
+        return EpisodeStart(observation, self._env.handoff, frame, hz, self._env.progress())
 
     def _smoke(self, scenario: TrialStart) -> np.ndarray | None:
         """A picture of the scenario's first state; None where that state cannot be had, which is a trial's
@@ -92,17 +96,20 @@ class SlotServer:
         began = time.perf_counter()
         success = over = False
         steps = 0
-        frames = []
+        frames, progress = [], []
         for action in actions:
             success = self._env.advance(action)
             steps += 1
             if self._filmed:
                 frames.append(self._env.render().copy())
+            if (done := self._env.progress()) is not None:
+                progress.append(done)
             over = success or self._env.out_of_steps
             if over:
                 break
         observation = None if over else self._simulator.observe()
-        return ActResult(observation, steps, success, over, time.perf_counter() - began, tuple(frames))
+        seconds = time.perf_counter() - began
+        return ActResult(observation, steps, success, over, seconds, tuple(frames), progress=tuple(progress))
 
     def close(self) -> None:
         """Closes the simulator."""

@@ -23,6 +23,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+from typing import Protocol as Interface
 
 import numpy as np
 
@@ -86,6 +87,13 @@ class GoBack:
     """How many; `directives.BY_RULE` for the platform's number."""
 
 
+class StartsTrials(Interface):
+    """What keeps a policy's histories (`policies.host`)."""
+
+    def start(self, seed: int | None) -> Any:
+        """Fresh history for a trial of that seed."""
+
+
 class Trial:
     """One policy on one scenario, once.
 
@@ -126,6 +134,7 @@ class Trial:
         self._action_width, self._check, self._rollback_steps = action_width, handoff_check, rollback_steps
         self._sim_s = self._policy_s = 0.0
         self._executed: list[np.ndarray] = []
+        self._progress: list[int] = []
         self._record = InterventionRecord()
         self._real_time = real_time
         self._clock: MovingClock | None = None
@@ -152,6 +161,10 @@ class Trial:
     def in_simulator(self) -> bool:
         """Whether a simulator's reply is due."""
         return self.state in IN_SIMULATOR
+
+    def open_history(self, host: StartsTrials) -> Any:
+        """What the policy side keeps for it: fresh, with its random stream."""
+        return host.start(self.seed)
 
     # --- its life
 
@@ -230,6 +243,8 @@ class Trial:
         elif isinstance(reply, EpisodeStart):
             self._leave(TrialState.HANDING_OFF, to=TrialState.WAITING)
             self.observation, self.handoff = reply.observation, reply.handoff
+            if reply.progress is not None:
+                self._progress = [percent(reply.progress)]
             if self._real_time is not None:
                 self._clock = MovingClock(self._real_time, reply.hz)
             if reply.handoff.problem is not None:
@@ -239,6 +254,8 @@ class Trial:
             self._record.rolled_back(self._directives[0].rollback, reply)
             self._sim_s += reply.seconds
             self.observation = reply.observation
+            if reply.progress is not None:
+                self._progress[-1:] = [percent(reply.progress)]
             if reply.solved:
                 self._end(Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
         elif isinstance(reply, StepResult | ActResult):
@@ -306,6 +323,7 @@ class Trial:
             policy_s=self._policy_s,
             actions_sha256=actions_digest(self._executed),
             interventions=self._record.entries(),
+            progress=self._progress or None,
         )
 
     def __repr__(self) -> str:
@@ -323,6 +341,8 @@ class Trial:
                     self._record.note(self._directives[index], self.steps + index)
                 self._record.acted(self._directives[index])
         self.steps += steps
+        told = reply.progress if isinstance(reply, ActResult) else (reply.progress,)
+        self._progress += [percent(done) for done in told if done is not None]
         if reply.observation is not None:
             self.observation = reply.observation
         if isinstance(reply, ActResult):
@@ -357,6 +377,11 @@ def actions_digest(actions: Iterable[np.ndarray]) -> str:
     for action in actions:
         digest.update(np.ascontiguousarray(action).tobytes())
     return digest.hexdigest()
+
+
+def percent(share: float) -> int:
+    """Progress as rows have it: whole per cent, and 100 for nothing less than all."""
+    return 100 if share >= 1.0 else min(max(round(100 * share), 0), 99)
 
 
 def action_problem(scenario: TrialStart, action: np.ndarray, width: int) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 
 from lerobot_roborecover.scenario import DeviationType, Outcome, Source, Stage, Start
 
-TRIAL_SCHEMA = 1
+TRIAL_SCHEMA = 2
+"""1: rows without `progress`; they are read as rows that say nothing of it."""
 MAX_LINE_BYTES = 2**24
 """Longest line of a log; a row has about 1.5 kB."""
 MAX_STEPS = 100_000
@@ -203,6 +204,14 @@ def _interventions(field: str, value: Any) -> None:
             _truth(f"{field}.solved_in_extra", counts["solved_in_extra"])
 
 
+def _progress(field: str, value: Any) -> None:
+    if value is None:
+        return
+    good = isinstance(value, list) and 0 < len(value) <= 2 * MAX_STEPS + 1
+    if not good or not all(type(share) is int and 0 <= share <= 100 for share in value):
+        raise _refuse(field, value, "neither null nor a list of whole per cents")
+
+
 def _schema(field: str, value: Any) -> None:
     if type(value) is not int or not 1 <= value <= TRIAL_SCHEMA:
         raise FieldProblem(
@@ -259,6 +268,7 @@ _CHECKS: dict[str, Callable[[str, Any], None]] = {
     "versions": _versions,
     "config_hash": _NAME,
     "finished_at": _moment,
+    "progress": _progress,
 }
 """A check for every field of a row, in the order of `TrialRow`."""
 _NAMES = frozenset(_CHECKS)
@@ -301,6 +311,8 @@ class RowChecker:
                 f"a JSON {type(record).__name__}, not an object with a row's fields. {_REMEDY}"
             )
         _schema("schema", record.get("schema"))
+        if record["schema"] == 1:
+            _say_nothing_of_progress(record)
         if record.keys() != _NAMES:
             odd = min(record.keys() ^ _NAMES)
             raise FieldProblem(f"field {_shown(odd)} is missing or not known. {_REMEDY}")
@@ -334,6 +346,12 @@ class RowChecker:
         if key is not None:
             known[key] = value
         return value
+
+
+def _say_nothing_of_progress(record: dict[str, Any]) -> None:
+    """Makes a row of schema 1 one of today's."""
+    record.setdefault("progress", None)
+    record["schema"] = TRIAL_SCHEMA
 
 
 def _check_together(record: Mapping[str, Any]) -> None:

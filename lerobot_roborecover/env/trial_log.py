@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import typing
-from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
@@ -138,6 +138,10 @@ class TrialRow:
     config_hash: str
     finished_at: str
     """UTC, ISO 8601."""
+    progress: list | None
+    """How much of the task was done where the policy took over, and after each of its steps, in whole per
+    cent; None where the platform does not tell, and in logs of schema 1. A rollback puts the number of the
+    state that it went to in place of the last one."""
 
     def key(self) -> tuple:
         """What makes it the same trial: a rerun that meets the key again skips it."""
@@ -174,6 +178,7 @@ def make_row(
     policy_s: float,
     actions_sha256: str,
     interventions: Iterable = (),
+    progress: Sequence[int] | None = None,
 ) -> TrialRow:
     """The one place where a trial row is built."""
     labels = scenario.labels
@@ -222,6 +227,7 @@ def make_row(
         versions=dict(protocol.versions),
         config_hash=protocol.config_hash(),
         finished_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        progress=None if progress is None else list(progress),
     )
 
 

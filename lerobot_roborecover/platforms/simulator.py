@@ -93,6 +93,17 @@ class Simulator(Protocol):
 
 
 @runtime_checkable
+class ShowsProgress(Protocol):
+    """What a simulator has beside `Simulator` that tells more of a task than whether it is done."""
+
+    def progress(self) -> float:
+        """How much of the task is done after the last step or reset: 0 to 1, and 1 just where `succeeded`.
+
+        Asked after every step of a trial, so it has to be cheap; it changes nothing in the simulation.
+        """
+
+
+@runtime_checkable
 class ControlModes(Protocol):
     """What a simulator has beside `Simulator` that reads actions in more than one way."""
 

@@ -123,9 +123,7 @@ class PolicyHost:
         """
         history = History(None)
         if seed is not None:
-            with torch.random.fork_rng(devices=self._gpus()):
-                torch.manual_seed(seed)
-                history.stream = self._stream_state()
+            self.reseed(history, seed)
         if not self.batched:
             policy = self._idle.pop() if self._idle else sharing_weights(self._policy)
             policy.reset()
@@ -134,6 +132,12 @@ class PolicyHost:
             for _ in range(step):
                 self._draw(history)
         return history
+
+    def reseed(self, history: History, seed: int) -> None:
+        """Begins a trial's random stream anew; what it remembers stays."""
+        with torch.random.fork_rng(devices=self._gpus()):
+            torch.manual_seed(seed)
+            history.stream = self._stream_state()
 
     def finish(self, history: History) -> None:
         """Gives back what a trial held."""

@@ -19,7 +19,7 @@ from typing import Any
 from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, Trial
-from lerobot_roborecover.env.trial_log import TrialRow, trial_key
+from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.policies.host import PolicyAwayError, PolicyError, Replica, ReplicaLostError
 from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
@@ -139,7 +139,7 @@ class Engine:
     def _start(self, seat: Seat, unit: Unit[TrialStart], replica: Replica) -> None:
         trial = self._run.trial(unit.scenario, unit.trial)
         seat.last = unit
-        seat.sitting = Sitting(seat, unit, trial, replica, replica.host.start(trial.seed))
+        seat.sitting = Sitting(seat, unit, trial, replica, trial.open_history(replica.host))
         filmed = self._videos is not None and self._videos.wants(unit)
         seat.slot.send("reset", trial.begin(filmed))
 
@@ -334,8 +334,7 @@ def unfinished[S: TrialStart](run: Run, units: Sequence[Unit[S]]) -> list[Unit[S
     """Units that the run's trial log does not hold yet."""
     if run.log is None:
         return list(units)
-    hash_ = run.protocol.config_hash()
-    keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
+    keys = run.keys([(u.scenario, u.trial) for u in units])
     return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
 
 

@@ -80,6 +80,11 @@ class EpisodeSpec:
     """Whether replies to `reset` and `act` bring a frame of every step, for a video."""
     rollback_steps: int = 0
     """How far back a rollback may be asked for: snapshots of as many steps are kept, where they are exact."""
+    played: np.ndarray | None = None
+    """(n, A) actions that are executed after the handoff and before anybody looks, in their own type: what a
+    fork's parent did."""
+    spent: int = 0
+    """New steps that count as taken when the policy takes over."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,8 @@ class EpisodeStart:
     """(H, W, 3) uint8, upright; where the trial is filmed."""
     hz: float = 0.0
     """Control steps per simulated second."""
+    progress: float | None = None
+    """Of the task, from 0 to 1; None where the simulator does not tell."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,8 @@ class StepResult:
     success: bool
     seconds: float
     """Wall time of the simulator, observation included."""
+    progress: float | None = None
+    """As in `EpisodeStart`."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,8 @@ class ActResult:
     attachment: bytes = b""
     """What the slot's server has made of a trial that is over, for the parent to keep: in a collection the
     rollout's record."""
+    progress: tuple[float, ...] = ()
+    """After each step; empty where the simulator does not tell."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +152,8 @@ class RollbackResult:
     """Whether the task's predicate holds there already, which leaves nothing to recover from."""
     frame: np.ndarray | None = None
     """(H, W, 3) uint8, where the trial is filmed."""
+    progress: float | None = None
+    """As in `EpisodeStart`."""
 
 
 @dataclass(frozen=True)

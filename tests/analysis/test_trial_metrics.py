@@ -6,14 +6,20 @@ import math
 from dataclasses import asdict, replace
 
 import numpy as np
+import pytest
 
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.results import analyse
 from lerobot_roborecover.analysis.summary import format_table, summarise
-from lerobot_roborecover.analysis.trial_metrics import METRICS, metric_estimates, scenario_means
+from lerobot_roborecover.analysis.trial_metrics import (
+    METRICS,
+    metric_estimates,
+    scenario_means,
+    trial_metrics,
+)
 from lerobot_roborecover.scenario import Outcome, Start
-from tests.support.trial_rows import three_policies, write_log
+from tests.support.trial_rows import three_policies, trial_row, write_log
 
 
 def rows_of(results, p):
@@ -22,7 +28,7 @@ def rows_of(results, p):
 
 def test_means_are_those_of_scenarios_means(tmp_path):
     results = analyse(read_study(three_policies(tmp_path, count=12)))
-    used, steps = METRICS
+    used, steps = METRICS[:2]
     for p in range(len(results.recovery.arms)):
         by_scenario: dict[str, list] = {}
         for row in rows_of(results, p):
@@ -34,6 +40,27 @@ def test_means_are_those_of_scenarios_means(tmp_path):
         means = scenario_means(results.recovery, steps)[:, p]
         solved = [[r.steps for r in rows if r.success] for _, rows in sorted(by_scenario.items())]
         np.testing.assert_allclose(means, [np.mean(s) if s else np.nan for s in solved])
+
+
+def test_partial_credit_by_hand(tmp_path):
+    """Up to a half, down by thirty, never above the handoff's ten again; and up for good after two steps."""
+    rows = [
+        trial_row(0, 0, False, steps=4, progress=[10, 50, 20, 5, 10]),
+        trial_row(1, 0, True, steps=4, progress=[10, 0, 10, 60, 100]),
+        trial_row(2, 0, False, steps=3, progress=[0, 0, 0, 0]),
+        trial_row(3, 0, outcome="sim_error"),
+    ]
+    best, drawdown, lasting = METRICS[2:]
+    assert [best.of(r) for r in rows[:3]] == [0.5, 1.0, 0.0]
+    assert [drawdown.of(r) for r in rows[:3]] == pytest.approx([0.45, 0.1, 0.0])
+    assert [lasting.of(r) for r in rows] == pytest.approx([math.nan, 3.0, math.nan, math.nan], nan_ok=True)
+    assert math.isnan(best.of(rows[3]))
+    # A log that says nothing of progress has no columns of it.
+    results = analyse(read_study([str(write_log(tmp_path / "a.jsonl", rows))]))
+    titles = [c.title for c in trial_metrics(results.recovery, results.draws).columns]
+    assert titles[-3:] == ["Best progress %", "Drawdown %", "Steps to lasting progress"]
+    results = analyse(read_study(three_policies(tmp_path, count=4)))
+    assert len(trial_metrics(results.recovery, results.draws).columns) == 3
 
 
 def test_what_infrastructure_ended_is_left_out_beside_the_headline(tmp_path):

@@ -21,14 +21,10 @@ from lerobot_roborecover.curation.donors import (
     judge,
     write_donors,
 )
-from lerobot_roborecover.curation.policy_trials import (
-    ACTIONS_FOLDER,
-    PolicyTrial,
-    actions_path,
-    read_trials,
-)
+from lerobot_roborecover.curation.policy_trials import PolicyTrial, read_trials
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.env.trial import actions_digest
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import ScenarioError

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
-from lerobot_roborecover.curation.policy_trials import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.curation.validate.dataset import validate_dataset
 from lerobot_roborecover.curation.validate.frames import Encoder, encoded, ssim, window
 from lerobot_roborecover.curation.validate.request import ValidationRequest
@@ -34,6 +33,7 @@ from lerobot_roborecover.curation.validate.validation import (
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frames import LastFrames, _encode, last_frames
 from lerobot_roborecover.env.trial import actions_digest
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.scenario import Pose, ScenarioError

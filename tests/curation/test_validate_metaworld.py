@@ -12,11 +12,11 @@ import pytest
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.candidates import Candidate, read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, write_candidates
-from lerobot_roborecover.curation.policy_trials import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.env.trial import actions_digest
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.walk import walk
 from tests.support.trial_rows import trial_row

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 
@@ -15,7 +16,9 @@ from lerobot_roborecover.env.trial_log import (
     trial_seed,
 )
 from lerobot_roborecover.scenario import Outcome
-from tests.support.factories import fake_scenario
+from tests.support.factories import fake_dataset, fake_scenario
+from tests.support.loop import evaluate
+from tests.support.trial_rows import trial_row
 
 PROTOCOL = Protocol("recovery", 0, "push@1", 1000, 10)
 
@@ -118,3 +121,33 @@ def test_trial_seeds_differ_in_all_three_arguments():
     assert len(seeds) == 8
     assert all(0 <= s < 2**63 for s in seeds)
     assert trial_seed(None, "a", 0) is None
+
+
+def test_logs_of_before_progress_are_read_and_joined(tmp_path):
+    """Schema 1 had no progress; what is read is written again as of today."""
+    new, old = asdict(trial_row(0, progress=[0, 40, 100])), asdict(trial_row(1))
+    old["schema"] = 1
+    del old["progress"]
+    log = tmp_path / "trials.jsonl"
+    log.write_text("".join(json.dumps(r) + "\n" for r in (new, old)), encoding="utf-8")
+    first, second = read_trial_log(log)
+    assert (first.progress, second.progress) == ([0, 40, 100], None)
+    again = tmp_path / "again.jsonl"
+    again.write_text("".join(json.dumps(asdict(r)) + "\n" for r in (first, second)), encoding="utf-8")
+    assert read_trial_log(again) == [first, second]
+    for wrong in ([], [101], [0.5], [True], "50", [-1], {}):
+        log.write_text(json.dumps(new | {"progress": wrong}) + "\n", encoding="utf-8")
+        with pytest.raises(TrialLogError, match="field 'progress'"):
+            read_trial_log(log)
+
+
+def test_every_step_has_its_progress(tmp_path):
+    """One number at the handoff and one after each step; 100 exactly on success."""
+    root = fake_dataset(tmp_path / "set", 4, horizon=60)
+    rows = evaluate(root, tmp_path / "log.jsonl", trials=1, batch=1)
+    assert {r.success for r in rows} == {True, False}
+    for row in rows:
+        assert len(row.progress) == row.steps + 1
+        assert (row.progress[-1] == 100) == row.success
+        assert max(row.progress[:-1]) < 100
+    assert any(0 < share < 100 for row in rows for share in row.progress)

@@ -350,3 +350,24 @@ def test_states_equal_lerobots_without_rendering(name, simulator, monkeypatch):
         assert np.array_equal(raw[:36], simulator.low_dim()[:36])
         assert np.array_equal(theirs._env.data.qpos, simulator._env.data.qpos)
     theirs.close()
+
+
+def test_progress_is_the_distance_that_is_gone(request):
+    """0 after a reset, 1 on success alone; asking changes nothing."""
+    from lerobot_roborecover.platforms import make_simulator, platform_named
+    from lerobot_roborecover.scenario import Reset
+
+    platform = platform_named("metaworld")
+    task = platform.task("reach-v3")
+    simulator = make_simulator("metaworld", obs_type="state")
+    request.addfinalizer(simulator.close)
+    driver = platform.experts["expert"].make
+    simulator.reset(task, Reset(seed=1))
+    act, seen = driver(simulator, task, np.random.default_rng(0)), [simulator.progress()]
+    while not simulator.succeeded() and len(seen) < 200:
+        simulator.step(act(len(seen) - 1))
+        before = simulator.state_sha256()
+        seen.append(simulator.progress())
+        assert simulator.state_sha256() == before
+    assert (seen[0], seen[-1]) == (0.0, 1.0)
+    assert 0.5 < max(seen[:-1]) < 1.0

@@ -40,7 +40,7 @@ def trial_row(scenario: int | str, trial: int = 0, success: bool = True, **chang
         "handoff_from_snapshot": True, "handoff_s": 0.1, "sim_s": 1.0, "policy_s": 1.0, "actions_sha256": "",
         "interventions": [], "options": {"obs_type": "pixels"}, "policy": policy, "execution_horizon": 10,
         "versions": {"lerobot": "0.6.1", "mujoco": "3.3.2"}, "config_hash": f"{policy}/{start}",
-        "finished_at": "2026-01-02T03:04:05.000+00:00",
+        "finished_at": "2026-01-02T03:04:05.000+00:00", "progress": None,
     }  # fmt: skip
     return TrialRow(**(values | changes))
 

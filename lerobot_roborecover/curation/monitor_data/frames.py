@@ -6,13 +6,14 @@ Imports neither LeRobot nor torch, so that a process starts in a second.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from lerobot_roborecover.platforms import Observation, Simulator, make_simulator
+from lerobot_roborecover.platforms.simulator import ShowsProgress
 from lerobot_roborecover.platforms.walk import follow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
@@ -37,18 +38,21 @@ class RenderedSteps:
     """Before each of the steps."""
     succeeded: bool
     """The predicate after the last action."""
+    progress: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(k,) of the task before each of the steps; NaN where the simulator does not tell."""
 
 
 def film(simulator: Simulator, job: RenderJob) -> RenderedSteps:
     """Replays one trajectory to its end; renders only what is asked for."""
     wanted = set(job.steps.tolist())
     simulator.reset(job.scenario.task, job.scenario.reset)
-    seen = []
+    seen, progress = [], []
     # Each action in its own type: the prefix in float64, the others as the policy gave them.
     for step in follow(simulator, chain(job.scenario.prefix, job.actions)):
         if step in wanted:
             seen.append(simulator.observe())
-    return RenderedSteps(seen, simulator.succeeded())
+            progress.append(simulator.progress() if isinstance(simulator, ShowsProgress) else np.nan)
+    return RenderedSteps(seen, simulator.succeeded(), np.array(progress, float))
 
 
 def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int) -> Iterator[RenderedSteps]:

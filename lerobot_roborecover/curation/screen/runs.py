@@ -16,15 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.policy_trials import (
-    ACTIONS_FOLDER,
     TRIALS_FILE,
     PolicyTrial,
-    actions_path,
     env_config,
     read_trials,
     run_trials,
 )
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.env.trial_log import TrialLog, check_retry
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_file, write_whole

@@ -95,6 +95,7 @@ class FakeSimulator:
         self._state = np.concatenate(
             [rng.uniform(-0.1, 0.1, 2) + np.array([0.0, -0.2]), np.zeros(2), rng.uniform(-0.1, 0.1, 2)]
         )
+        self._first_puck = self._state[4:6].copy()
 
     def step(self, action: np.ndarray) -> None:
         """Drives the mass: `action` (2,) is a velocity command, 1 being 0.6 metres per second, with a
@@ -168,6 +169,16 @@ class FakeSimulator:
         if self._task is None or self._task.name not in _GOALS:
             return False
         return float(np.linalg.norm(self._state[4:6] - _GOALS[self._task.name])) < _GOAL_RADIUS_M
+
+    def progress(self) -> float:
+        """How much nearer to the goal the puck is than it was at the reset."""
+        if self._task is None or self._task.name not in _GOALS:
+            return 0.0
+        if self.succeeded():
+            return 1.0
+        goal = np.array(_GOALS[self._task.name])
+        now, first = (float(np.linalg.norm(puck - goal)) for puck in (self._state[4:6], self._first_puck))
+        return min(max(1.0 - now / first, 0.0), 0.99)
 
     def bodies(self) -> dict[str, Pose]:
         """Mass as end effector, and the puck."""

@@ -194,6 +194,13 @@ class LiberoSimulator:
         self._require_reset()
         return bool(self._task.env._check_success())
 
+    def progress(self) -> float:
+        """The share of the goal's predicates that hold now: LIBERO's goals are conjunctions."""
+        self._require_reset()
+        env = self._task.env
+        goals = env.parsed_problem["goal_state"]
+        return sum(bool(env._eval_predicate(goal)) for goal in goals) / len(goals)
+
     def set_control_mode(self, mode: str) -> None:
         """Takes actions as `relative` or `absolute` until the next reset, which makes them relative again."""
         _require("control_mode", mode, _CONTROL_MODES)

@@ -103,6 +103,7 @@ class MetaworldSimulator:
         self._first_layouts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._raw = np.zeros(ENVIRONMENT_STATE_DIM)
         self._success = False
+        self._first_distance_m = self._distance_m = 0.0
         self._frame: np.ndarray | None = None
         self._tracked: dict[str, int] = {}
         self._parts: dict[str, set[int]] = {}
@@ -147,6 +148,7 @@ class MetaworldSimulator:
         self._raw, _ = env.reset(seed=reset.seed)
         self._task_name, self._handled = task.name, handled_body(env, self._parts, self._raw)
         env._last_stable_obs = None
+        self._first_distance_m = self._distance_m = self._distance_now()
         self._success = False
         self._frame = None
 
@@ -159,7 +161,16 @@ class MetaworldSimulator:
             )
         self._raw, _, _, _, info = self._ready().step(action)
         self._success = bool(info["success"])
+        self._distance_m = float(info["obj_to_target"])
         self._frame = None
+
+    def _distance_now(self) -> float:
+        """`obj_to_target` of the present state; what working it out changes in the task is put back."""
+        env = self._ready()
+        before = _attributes(env)
+        _, info = env.evaluate_state(self._raw, np.zeros(self.action_dim, np.float32))
+        _set_attributes(env, before)
+        return float(info["obj_to_target"])
 
     def observe(self) -> Observation:
         """LeRobot's raw observation, or the low-dimensional one; see the class."""
@@ -188,6 +199,14 @@ class MetaworldSimulator:
     def succeeded(self) -> bool:
         """Meta-World's own success of the last step; False right after a reset."""
         return self._success
+
+    def progress(self) -> float:
+        """1 on success; else by how much Meta-World's own `obj_to_target` is shorter than at the reset."""
+        if self._success:
+            return 1.0
+        if not self._first_distance_m > 0.0:
+            return 0.0
+        return min(max(1.0 - self._distance_m / self._first_distance_m, 0.0), 0.99)
 
     def low_dim(self) -> np.ndarray:
         """(39,) float64: Meta-World's observation with the goal shown, whatever `obs_type`."""

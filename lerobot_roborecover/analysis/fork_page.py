@@ -1,0 +1,50 @@
+"""Writes what forks gained: tables, picture and one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lerobot_roborecover.analysis.fork_figure import gain_by_step
+from lerobot_roborecover.analysis.fork_gain import ForkGains, gain_tables
+from lerobot_roborecover.analysis.page import picture, render_page
+from lerobot_roborecover.analysis.style import render
+from lerobot_roborecover.analysis.tables import Table, to_csv, to_markdown
+from lerobot_roborecover.whole import write_whole
+
+PAGE = "gain.html"
+
+
+def write_gains(gains: ForkGains, out: Path, command: str) -> list[Table]:
+    """Writes `gain.html`, `gain.md`, a CSV file of each table, and `fork_gain.svg` and `.png`.
+
+    Args:
+        gains: of the log.
+        out: folder.
+        command: that made the forks.
+
+    Returns:
+        The tables.
+    """
+    tables, figure = gain_tables(gains), gain_by_step(gains)
+    out.mkdir(parents=True, exist_ok=True)
+    svg, png = render(figure)
+    write_whole(out / "fork_gain.svg", svg)
+    write_whole(out / "fork_gain.png", png)
+    for table in tables:
+        write_whole(out / f"{table.name}.csv", to_csv(table))
+    write_whole(out / "gain.md", "\n".join(map(to_markdown, tables)))
+    about = {"Made by": command, "Exactness": reproduced_text(gains)}
+    page = render_page(
+        "tables_figures.html.j2", title="Forks", about=about, pictures=[picture(figure)], tables=tables
+    )
+    write_whole(out / PAGE, page)
+    return tables
+
+
+def reproduced_text(gains: ForkGains) -> str:
+    """Whether continuing gave the logged trials' rest."""
+    same, of = gains.reproduced
+    return (
+        f"Continued on their own random stream, {same} of {of} logged trials end as they did, action for "
+        "action."
+    )

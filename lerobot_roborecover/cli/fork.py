@@ -1,0 +1,95 @@
+"""`roborecover fork`."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+HELP = (
+    "Continue logged trials from some of their steps in several ways, and say what each gains over going on: "
+    "recovery gain = P(success | intervene) - P(success | continue)."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add = parser.add_argument
+    add("logs", nargs="+", type=Path, help="trial logs of runs with --env.record_actions=true")
+    add("--policy", required=True, help="checkpoint that ran the trials: folder or Hub id")
+    add("--out", required=True, type=Path, help="folder of the forks' log and page; a rerun goes on there")
+    add(
+        "--arm", action="append", default=[], metavar="ARM",
+        help="what to do at a fork, beside going on: fresh, rollback:K, correction:CHECKPOINT, "
+        "policy:CHECKPOINT, human:MODULE:FUNCTION; may be given again (fresh and rollback:30)",
+    )  # fmt: skip
+    add("--every", type=int, default=25, help="fork every so many steps, from the handoff on (%(default)s)")
+    add("--at", metavar="STEPS", default="", help="fork at these steps instead, e.g. 0,40,80")
+    add("--of", default="all", choices=("all", "failures", "successes"), help="which trials (%(default)s)")
+    add("--trials", type=int, default=0, help="trials of each scenario, at most (all)")
+    add(
+        "--repeats",
+        type=int,
+        default=1,
+        help="random streams for each fork, shared by its arms (%(default)s)",
+    )
+    add("--correction-steps", type=int, default=30, help="steps of a correction policy (%(default)s)")
+    add("--scenarios", default="", help="scenario set of the trials (default: the one that they name)")
+    add("--revision", help="commit, tag or branch of that set on the Hub")
+    add(
+        "--env", action="append", default=[], metavar="NAME=VALUE",
+        help="option of the recovery env type that the rows do not say; may be given again",
+    )  # fmt: skip
+    add(
+        "--policy-option", action="append", default=[], metavar="NAME=VALUE",
+        help="option of the policy as it was run, e.g. n_action_steps=10; may be given again",
+    )  # fmt: skip
+    add("--device", help="of the policies")
+    add("--slots", type=int, default=0, help="simulators at once (as roborecover eval)")
+    add(
+        "--max-batch", type=int, default=1,
+        help="observations per inference; above 1 a policy's last bits depend on its company (%(default)s)",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the forks, writes the page, prints the gains."""
+    from lerobot_roborecover.analysis.fork_gain import fork_gains
+    from lerobot_roborecover.analysis.fork_page import PAGE, reproduced_text, write_gains
+    from lerobot_roborecover.analysis.tables import to_text
+    from lerobot_roborecover.curation.forks.arms import parse_arm
+    from lerobot_roborecover.curation.forks.parents import Choice
+    from lerobot_roborecover.curation.forks.run import ForkRequest, run_forks
+    from lerobot_roborecover.errors import OptionError
+    from lerobot_roborecover.progress import Progress
+
+    try:
+        at = tuple(int(step) for step in args.at.split(",") if step.strip())
+    except ValueError:
+        raise OptionError(f"--at={args.at}: steps, e.g. 0,40,80") from None
+    request = ForkRequest(
+        args.logs,
+        args.policy,
+        args.out,
+        [parse_arm(text) for text in dict.fromkeys(args.arm or ("fresh", "rollback:30"))],
+        Choice(args.of, args.trials, args.every, at),
+        args.repeats,
+        args.scenarios,
+        args.revision,
+        args.env,
+        args.policy_option,
+        correction_steps=args.correction_steps,
+        device=args.device,
+        slots=args.slots,
+        max_batch=args.max_batch,
+    )
+    result = run_forks(request, Progress("fork").of)
+    for reason, count in result.dropped.most_common():
+        print(f"note: {count} trials not forked: {reason}", file=sys.stderr)
+    gains = fork_gains(result.rows)
+    tables = write_gains(gains, args.out, shlex.join(["roborecover", *sys.argv[1:]]))
+    print("\n\n".join(f"{table.title}\n{to_text(table)}" for table in tables[:3]))
+    print(f"\n{reproduced_text(gains)}\nlog {result.log}\npage {args.out / PAGE}")
+    same, of = gains.reproduced
+    return 0 if same == of else 1

@@ -1,0 +1,1 @@
+"""Training data from trials, donors and forks, with what weights them."""
