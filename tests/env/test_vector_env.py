@@ -273,4 +273,4 @@ def test_log_lines_are_plain_json_with_everything_a_table_needs(dataset, tmp_pat
         "versions",
         "finished_at",
     } <= record.keys()
-    assert read_trial_log(log)[0].schema == 1
+    assert read_trial_log(log)[0].schema == 2
