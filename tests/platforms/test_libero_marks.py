@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
 from lerobot_roborecover.curation.annotation.traces import traces
-from lerobot_roborecover.platforms.simulator import GOAL_OF, is_mark
+from lerobot_roborecover.platforms.simulator import GOAL_OF, HANDLE, is_mark
 from lerobot_roborecover.recording import Recorder
 from lerobot_roborecover.scenario import Reset
 
@@ -46,6 +47,22 @@ def test_each_of_two_goals_has_its_mark_and_the_traces_show_both(simulator):
     assert np.array_equal(wanted, inside)
 
 
-def test_a_goal_about_a_joint_has_no_mark(simulator):
+def test_a_drawer_is_wanted_where_it_is_closed_by_its_handle(simulator):
+    simulator.reset(task_named("put_the_black_bowl_in_the_bottom_drawer"), Reset(seed=7, init_state_index=0))
+    poses = simulator.bodies()
+    drawer = "white_cabinet_1_cabinet_bottom"
+    assert {name for name in poses if is_mark(name)} == {
+        drawer + HANDLE, drawer + GOAL_OF, "akita_black_bowl_1_main" + GOAL_OF,
+    }  # fmt: skip
+    assert 0.1 < poses[drawer + HANDLE].distance_m(poses[drawer + GOAL_OF]) < 0.2, "it stands open"
+    joint = simulator.libero_env.sim.data._data.joint("white_cabinet_1_bottom_level")
+    joint.qpos[0] = 0.0
+    mujoco.mj_kinematics(simulator.libero_env.sim.model._model, simulator.libero_env.sim.data._data)
+    shut = simulator.bodies()
+    assert shut[drawer + HANDLE].distance_m(shut[drawer + GOAL_OF]) < 1e-6
+    assert shut[drawer + GOAL_OF].distance_m(poses[drawer + GOAL_OF]) < 1e-3, "the place stays where it is"
+
+
+def test_a_goal_about_what_turns_has_no_mark(simulator):
     simulator.reset(task_named("libero_goal/turn_on_the_stove"), Reset(seed=7, init_state_index=0))
     assert not any(map(is_mark, simulator.bodies()))

@@ -100,7 +100,9 @@ def _places(
 ) -> dict[str, Place]:
     found = {}
     for name, points in objects.items():
-        mark = steps.bodies.get(GOAL if name + HANDLE in steps.bodies else name + GOAL_OF)
+        mark = steps.bodies.get(name + GOAL_OF)
+        if mark is None and name + HANDLE in steps.bodies:
+            mark = steps.bodies.get(GOAL)
         goal = None if mark is None else np.linalg.norm(points - mark[:, :3], axis=1)[:-1]
         reach = np.min([np.linalg.norm(points - hand, axis=1) for hand in hands], axis=0)[:-1]
         away = points - points[min(start, len(points) - 1)]

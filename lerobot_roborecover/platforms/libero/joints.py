@@ -28,6 +28,9 @@ class FixtureJoint:
         low, high = model.jnt_range[self._id]
         self._away = -1.0 if -low > high else 1.0
         """Sign of the coordinate away from closed or off, which is about zero."""
+        self._far = float(low if -low > high else high)
+        self.body = int(model.jnt_bodyid[self._id])
+        """Id of the body that it moves."""
 
         self.hinged = int(model.jnt_type[self._id]) == _HINGE
         """Whether it turns; else it slides."""
@@ -60,6 +63,10 @@ class FixtureJoint:
         """(3,) metres: middle of what stands out furthest from a drawer."""
         out = self._data.geom_xpos[self._geoms] @ self.opening
         return self._data.geom_xpos[self._geoms[np.argmax(out)]].copy()
+
+    def way_m(self, open_it: bool) -> np.ndarray:
+        """(3,) metres: how far a drawer is from all open, or from closed."""
+        return ((self._far if open_it else 0.0) - float(self._data.qpos[self._address])) * self.axis
 
     @property
     def top_m(self) -> float:

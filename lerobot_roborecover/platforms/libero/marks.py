@@ -1,14 +1,16 @@
-"""Where a LIBERO task wants its objects: a mark for each goal that is about a place."""
+"""Where a LIBERO task wants its objects and drawers: marks for each goal that is about a place."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 
 from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
-from lerobot_roborecover.platforms.simulator import GOAL_OF
+from lerobot_roborecover.platforms.libero.joints import FixtureJoint
+from lerobot_roborecover.platforms.simulator import GOAL_OF, HANDLE
 from lerobot_roborecover.scenario import Pose
 
 if TYPE_CHECKING:
@@ -17,38 +19,51 @@ if TYPE_CHECKING:
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class PlaceMark:
-    """One goal's mark."""
-
-    name: str
-    """Of the object's body, with `GOAL_OF`."""
-    site: int | None
-    """Where it belongs: this site's place,"""
-    body: int
-    """or else this body's."""
-
-    def pose(self, data: mujoco.MjData) -> Pose:
-        """Where the place is now, without a direction of its own."""
-        x, y, z = map(float, data.xpos[self.body] if self.site is None else data.site_xpos[self.site])
-        return Pose((x, y, z), _UPRIGHT)
-
-
-def place_marks(env: LiberoEnv, model: mujoco.MjModel) -> tuple[PlaceMark, ...]:
-    """The marks of a task: of every `On` and `In` of its goal, in LIBERO's order.
+class PlaceMarks:
+    """The marks of a task: of every `On` and `In` of its goal, in its order, and of every drawer that is to
+    be opened or closed, whose handle is marked, too. What turns has none.
 
     Args:
         env: LIBERO's environment of the task.
         model: as compiled last.
+        data: the simulation, read at every call.
     """
-    found = []
-    for kind, *about in env.parsed_problem["goal_state"]:
-        if kind not in PLACE_KINDS:
-            continue
-        item, place = about
-        name = model.body(env.obj_body_id[item]).name + GOAL_OF
+
+    def __init__(self, env: LiberoEnv, model: mujoco.MjModel, data: mujoco.MjData):
+        self._env, self._model, self._data = env, model, data
+        self._places: dict[str, Callable[[], np.ndarray]] = {}
+        for kind, *about in env.parsed_problem["goal_state"]:
+            if kind in PLACE_KINDS:
+                self._add_object(*about)
+            elif kind in ("open", "close"):
+                self._add_drawer(about[0], kind == "open")
+
+    def poses(self) -> dict[str, Pose]:
+        """The marks now, without a direction of their own."""
+        return {name: Pose(_floats(place()), _UPRIGHT) for name, place in self._places.items()}
+
+    def _add_object(self, item: str, place: str) -> None:
+        env, data = self._env, self._data
+        name = self._model.body(env.obj_body_id[item]).name + GOAL_OF
         if place in env.object_sites_dict:
-            found.append(PlaceMark(name, env.sim.model.site_name2id(place), -1))
+            site = env.sim.model.site_name2id(place)
+            self._places[name] = lambda: data.site_xpos[site]
         else:
-            found.append(PlaceMark(name, None, env.obj_body_id[place]))
-    return tuple(found)
+            body = env.obj_body_id[place]
+            self._places[name] = lambda: data.xpos[body]
+
+    def _add_drawer(self, region: str, open_it: bool) -> None:
+        site = self._env.object_sites_dict.get(region)
+        if site is None or not site.joints:
+            return
+        joint = FixtureJoint(self._model, self._data, site.joints[0])
+        if joint.hinged:
+            return
+        name = self._model.body(joint.body).name
+        self._places[name + HANDLE] = lambda: joint.handle_m
+        self._places[name + GOAL_OF] = lambda: joint.handle_m + joint.way_m(open_it)
+
+
+def _floats(place: Iterable[float]) -> tuple[float, float, float]:
+    x, y, z = map(float, place)
+    return x, y, z

@@ -24,7 +24,7 @@ import numpy as np
 from lerobot_roborecover.platforms.libero.assets import package_root
 from lerobot_roborecover.platforms.libero.contacts import ContactCheck
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
-from lerobot_roborecover.platforms.libero.marks import PlaceMark, place_marks
+from lerobot_roborecover.platforms.libero.marks import PlaceMarks
 from lerobot_roborecover.platforms.libero.osc import OscControl, osc_control
 from lerobot_roborecover.platforms.libero.reach import ArmReach
 from lerobot_roborecover.platforms.limits import Workspace
@@ -232,12 +232,12 @@ class LiberoTask:
         """World poses of the grip site (`eef`), of everything that can move, and of the goal's marks."""
         poses = {"eef": site_pose(self.data, self.robot.eef_site_id)}
         poses |= {name: body_pose(self.data, body) for name, body in self.movable_bodies.items()}
-        return poses | {mark.name: mark.pose(self.data) for mark in self.place_marks}
+        return poses | self.place_marks.poses()
 
     @cached_property
-    def place_marks(self) -> tuple[PlaceMark, ...]:
+    def place_marks(self) -> PlaceMarks:
         """Of the goal's places."""
-        return place_marks(self.env, self.model)
+        return PlaceMarks(self.env, self.model, self.data)
 
     @cached_property
     def reach(self) -> ArmReach:
