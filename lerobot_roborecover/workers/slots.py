@@ -21,6 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.transport import Channel, make_memory
 
 _LOG_TAIL_BYTES = 600
 _START_S = 60.0
@@ -90,7 +91,7 @@ class WorkerSlot:
         self._timeout_s = timeout_s
         self._start_s = _START_S if config.start_s is None else config.start_s
         self._process: subprocess.Popen | None = None
-        self._connection: Connection | None = None
+        self._channel: Channel | None = None
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the slot
         self._unsent: SlotFailure | None = None
         self.deadline = 0.0
@@ -103,8 +104,8 @@ class WorkerSlot:
         already."""
         if self._unsent is not None:
             return True
-        assert self._connection is not None
-        return self._connection
+        assert self._channel is not None
+        return self._channel.connection
 
     def opened(self) -> None:
         """Nothing to find out."""
@@ -129,27 +130,31 @@ class WorkerSlot:
         # A package directory on sys.path through the caller's working directory must be found by the worker
         # as well.
         environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+        memory = make_memory()
+        handed = [theirs.fileno(), *([] if memory is None else [memory])]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "lerobot_roborecover.workers.worker", str(theirs.fileno())],
-            pass_fds=[theirs.fileno()],
+            [sys.executable, "-m", "lerobot_roborecover.workers.worker", *map(str, handed)],
+            pass_fds=handed,
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
             env={k: v for k, v in environment.items() if v is not None},
         )
         theirs.close()
-        self._connection = Connection(ours.detach())
-        self._connection.send(self._config)
+        self._channel = Channel(Connection(ours.detach()), memory)
+        if memory is not None:
+            os.close(memory)
+        self._channel.send(self._config)
         self._started = False
 
     def send(self, command: str, argument: object = None) -> None:
         """Sends a command to the worker; starts one where it was ended."""
-        if self._connection is None:
+        if self._channel is None:
             self._start()
-        assert self._connection is not None
+        assert self._channel is not None
         self.deadline = time.monotonic() + self._timeout_s + (0.0 if self._started else self._start_s)
         try:
-            self._connection.send(Command(command, argument))
+            self._channel.send(Command(command, argument))
         except (BrokenPipeError, ConnectionResetError):
             self._unsent = self._replace("died")
 
@@ -158,12 +163,12 @@ class WorkerSlot:
         if self._unsent is not None:
             failure, self._unsent = self._unsent, None
             return failure
-        assert self._connection is not None
+        assert self._channel is not None
         try:
             left_s = max(self.deadline - time.monotonic(), 0.0)
-            if not self._connection.poll(left_s if left_s < math.inf else None):
+            if not self._channel.connection.poll(left_s if left_s < math.inf else None):
                 return self._replace("hung")
-            reply = self._connection.recv()
+            reply = self._channel.receive()
             self._started = True
             return reply
         except (EOFError, ConnectionResetError):
@@ -200,9 +205,9 @@ class WorkerSlot:
         self._unsent = None
 
     def _stop(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -210,9 +215,9 @@ class WorkerSlot:
 
     def close(self) -> None:
         """Lets the worker finish its command and exit; kills it if it does not."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
         if self._process is not None:
             try:
                 self._process.wait(5.0)

@@ -1,4 +1,5 @@
-"""A simulator worker process: `python -m lerobot_roborecover.workers.worker FD`, commands in, replies out.
+"""A simulator worker process: `python -m lerobot_roborecover.workers.worker FD [MEMORY_FD]`, commands in,
+replies out.
 
 Started as a fresh interpreter rather than through multiprocessing, whose spawn and forkserver methods import
 the parent's main module again: under `lerobot-eval` that is LeRobot and torch, 15 s and 800 MB a worker.
@@ -14,21 +15,22 @@ from multiprocessing.connection import Connection
 
 from lerobot_roborecover.workers.messages import Command, Server, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.parent import end_with_parent
+from lerobot_roborecover.workers.transport import Channel
 
 
-def main(fd: int) -> None:
+def main(fd: int, memory: int | None = None) -> None:
     """Serves commands from the inherited socket until the parent closes it."""
     # The parent decides when to stop: Ctrl-C reaches the whole process group.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # A parent that is gone already, or that ends elsewhere than on Linux, shows as the socket's end; a worker
     # stuck in native code would not see that.
     end_with_parent(os.getppid())
-    connection = Connection(fd)
+    channel = Channel(Connection(fd), memory)
     server: Server | None = None
     failure = SlotFailure("raised", "the worker was not configured")
     while True:
         try:
-            message: SlotConfig | Command = connection.recv()
+            message: SlotConfig | Command = channel.receive()
         except EOFError:
             break
         try:
@@ -43,7 +45,7 @@ def main(fd: int) -> None:
                 failure = SlotFailure("raised", f"no simulator could be made: {reply.message}")
                 continue
         try:
-            connection.send(reply)
+            channel.send(reply)
         except (BrokenPipeError, ConnectionResetError):
             break
     if server is not None:
@@ -51,4 +53,4 @@ def main(fd: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(*map(int, sys.argv[1:]))
