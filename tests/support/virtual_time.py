@@ -21,11 +21,12 @@ class World:
         cores: simulators that can work at full speed at once.
         step_s: of a simulator, on a core of its own.
         jitter: standard deviation of what a command takes, as a part of it.
+        look_s: of the pictures at a command's end, on the same core.
     """
 
-    def __init__(self, cores: int, step_s: float, jitter: float = 0.0):
+    def __init__(self, cores: int, step_s: float, jitter: float = 0.0, look_s: float = 0.0):
         self.now = 0.0
-        self.cores, self.step_s, self.jitter = cores, step_s, jitter
+        self.cores, self.step_s, self.jitter, self.look_s = cores, step_s, jitter, look_s
         self.rng = np.random.default_rng(0)
         self.working: list[VirtualSlot] = []
         self.core_s = 0.0
@@ -84,7 +85,8 @@ class VirtualSlot:
             over = self._steps >= horizon
             self._reply = ActResult({}, steps, False, over, 0.0)
         world = self._world
-        self.left_s = steps * world.step_s * max(1 + world.jitter * world.rng.standard_normal(), 0.1)
+        takes_s = steps * world.step_s + world.look_s
+        self.left_s = takes_s * max(1 + world.jitter * world.rng.standard_normal(), 0.1)
         world.working.append(self)
 
     def receive(self) -> Any:
@@ -97,7 +99,10 @@ class VirtualHost:
 
     batched, max_batch = True, 64
 
-    def __init__(self, world: World, fixed_s: float, each_s: float = 0.0, chunk: int = 10):
+    def __init__(
+        self, world: World, fixed_s: float, each_s: float = 0.0, chunk: int = 10, max_batch: int = 64
+    ):
+        self.max_batch = max_batch
         self._world, self._fixed_s, self._each_s = world, fixed_s, each_s
         self._chunk = np.zeros((chunk, 2), np.float32)
         self.batches: list[int] = []
