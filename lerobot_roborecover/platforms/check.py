@@ -24,6 +24,7 @@ from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.platforms import Platform, Simulator, platform_named
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.probe import answer, last_answer
+from lerobot_roborecover.platforms.simulator import ShowsProgress
 from lerobot_roborecover.platforms.walk import follow, walk
 from lerobot_roborecover.scenario import Pose, Reset, Rollout, Task
 
@@ -127,7 +128,7 @@ def run(simulator: Simulator, task: Task, reset: Reset, actions: np.ndarray, *, 
         task: to reset to.
         reset: its first state.
         actions: (T, A) float64.
-        look: observe and render after every step.
+        look: observe, render and ask for progress after every step.
     """
     hashes, success, parts = [], [], []
     tell = getattr(simulator, "state_parts", None)
@@ -139,6 +140,8 @@ def run(simulator: Simulator, task: Task, reset: Reset, actions: np.ndarray, *, 
         if look and step < len(actions):
             simulator.observe()
             simulator.render()
+            if isinstance(simulator, ShowsProgress):
+                simulator.progress()
     return Trace(tuple(hashes), tuple(success), simulator.bodies(), tuple(parts))
 
 
@@ -210,6 +213,12 @@ def _state(simulator: Simulator, task: Task, trace: Trace) -> Check:
             wrong.append("observe() is not in observation_space: keys, shapes, dtypes or bounds differ")
     except Exception as err:  # a simulator may raise whatever it likes
         wrong.append(f"observe() fails: {type(err).__name__}: {err}"[:500])
+    if isinstance(simulator, ShowsProgress):
+        share, done = simulator.progress(), simulator.succeeded()
+        if not 0.0 <= share <= 1.0 or (share == 1.0) != done:
+            wrong.append(
+                f"progress() is {share!r} where succeeded() is {done}: from 0 to 1, and 1 on success alone"
+            )
     return _verdict(f"{task.name}: state", wrong, f"{len(trace.bodies)} bodies")
 
 

@@ -167,3 +167,19 @@ def test_trials_say_which_fast_pictures_they_saw(options, said):
 
     decisive = env_config("libero", "none", options).run_spec().decisive
     assert ("fast_pictures" in decisive) == said
+
+
+@pytest.mark.slow
+def test_progress_is_the_share_of_goals_that_hold(sim):
+    """Two objects into one place, one after the other: none, half, all, and all exactly on success."""
+    task = task_of("libero_10", "both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket")
+    sim.reset(task, PLATFORM.first_reset(task))
+    for _ in range(10):
+        sim.step(PLATFORM.no_op())
+    act = PLATFORM.experts["scripted"].make(sim, task, np.random.default_rng(0))
+    seen = [sim.progress()]
+    while not sim.succeeded() and len(seen) < 800:
+        sim.step(act(len(seen) - 1))
+        seen.append(sim.progress())
+        assert (seen[-1] == 1.0) == sim.succeeded()
+    assert list(dict.fromkeys(seen)) == [0.0, 0.5, 1.0]
