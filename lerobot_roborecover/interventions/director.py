@@ -24,8 +24,11 @@ import numpy as np
 import torch
 
 from lerobot_roborecover.env.directives import BY_RULE, Controller, Directive, attach
+from lerobot_roborecover.interventions.detectors.interface import Detector, Watch, as_detector
+from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
+from lerobot_roborecover.interventions.detectors.watching import Watcher
 from lerobot_roborecover.interventions.driver import Driver
-from lerobot_roborecover.interventions.members import MemberHost, join
+from lerobot_roborecover.interventions.members import MemberHost
 from lerobot_roborecover.interventions.monitor_interface import Monitor
 from lerobot_roborecover.policies.host import Chunk, PolicyError
 
@@ -51,6 +54,8 @@ class DirectedTrial:
     """Steps that the correction policy still has."""
     first: Directive = field(default_factory=Directive)
     """What is to stand beside the next action."""
+    watch: Watch | None = None
+    """What the monitor has seen of it; None without one."""
 
 
 class Director:
@@ -59,7 +64,8 @@ class Director:
     Args:
         members: the policies, by who they act as; `Controller.BASE` is among them.
         mode: of the composite policy.
-        monitor: decides when; None intervenes at the recovery point.
+        monitor: a monitor or any other detector, which decides when; None intervenes at the recovery point.
+        probe: into the base policy, for a detector that looks into it.
         driver: the person, for mode `human`.
         correction_steps: of the correction policy.
         rewind_steps: of a rollback; None follows the paper's rule.
@@ -70,13 +76,15 @@ class Director:
         members: Mapping[Controller, MemberHost],
         mode: str,
         *,
-        monitor: Monitor | None = None,
+        monitor: Monitor | Detector | None = None,
+        probe: PolicyProbe | None = None,
         driver: Driver | None = None,
         correction_steps: int = 30,
         rewind_steps: int | None = None,
     ):
         self.members = dict(members)
-        self._mode, self._monitor, self._driver = mode, monitor, driver
+        self._mode, self._driver = mode, driver
+        self._watcher = None if monitor is None else Watcher(as_detector(monitor), probe)
         self._correction_steps = correction_steps
         self._rollback = BY_RULE if rewind_steps is None else rewind_steps
         self._width = self.members[Controller.BASE].action_width
@@ -88,6 +96,7 @@ class Director:
             seed: the trial's; None where the run has none, or where torch's own generator is seeded for it.
         """
         episode = DirectedTrial(seed, pending=self._mode != "direct")
+        episode.watch = self._watcher.start(seed) if self._watcher else None
         episode.history = self.members[Controller.BASE].start(seed)
         return episode
 
@@ -148,14 +157,16 @@ class Director:
     ) -> None:
         pending = [i for i, e in enumerate(episodes) if e.pending]
         fires = dict.fromkeys(pending, True)
-        if self._monitor is not None and pending:
-            size = max(self._monitor.max_batch, 1)
+        if self._watcher is not None and pending:
+            size = self._watcher.max_batch
             for at in range(0, len(pending), size):
                 part = pending[at : at + size]
                 began = time.perf_counter()
                 try:
-                    verdicts = self._monitor.judge(
-                        join([observations[i] for i in part]), [instructions[i] for i in part]
+                    verdicts = self._watcher.judge(
+                        [w for i in part if (w := episodes[i].watch) is not None],
+                        [{k: v[0] for k, v in observations[i].items()} for i in part],
+                        [instructions[i] for i in part],
                     )
                 except Exception as err:  # as with policies: whatever a monitor raises costs its trials alone
                     for i in part:
@@ -239,7 +250,7 @@ class Director:
         take = len(queue)
         if episode.controller is Controller.CORRECTION:
             take = min(take, episode.left)
-        if episode.pending and self._monitor is not None:
+        if episode.pending and self._watcher is not None:
             take = 1
         rows = attach(np.ascontiguousarray(queue[:take]), episode.first)
         episode.queue = queue[take:] if take < len(queue) else None

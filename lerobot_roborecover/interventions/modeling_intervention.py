@@ -19,11 +19,14 @@ from lerobot_roborecover.interventions.configuration_intervention import (
     MonitorConfig,
     RoboRecoverInterventionConfig,
 )
+from lerobot_roborecover.interventions.detectors.base import DetectorRewardModel
+from lerobot_roborecover.interventions.detectors.interface import Detector, MonitorDetector
+from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
+from lerobot_roborecover.interventions.detectors.progress import ProgressDetector
 from lerobot_roborecover.interventions.director import DirectedTrial, Director
 from lerobot_roborecover.interventions.driver import load_driver
 from lerobot_roborecover.interventions.host import InterventionHost, tensors
 from lerobot_roborecover.interventions.members import MemberHost, load_member
-from lerobot_roborecover.interventions.monitor_interface import Monitor
 from lerobot_roborecover.policies.host import PolicyError, Processor
 
 
@@ -55,10 +58,14 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
                     f"--policy.correction.path={config.correction.path}: its actions and those of the base "
                     f"policy have widths {sorted(widths)}; they must be of one action space"
                 )
+        base, preprocessor, _ = members[Controller.BASE].parts
+        probe = PolicyProbe(base, preprocessor)
+        monitor = _monitor(config.monitor, str(config.device), features, probe) if config.monitored else None
         self.director = Director(
             members,
             config.mode,
-            monitor=_monitor(config.monitor, str(config.device), features) if config.monitored else None,
+            monitor=monitor,
+            probe=probe,
             driver=load_driver(config.driver) if config.mode == "human" else None,
             correction_steps=config.correction_steps,
             rewind_steps=config.rewind_steps,
@@ -157,17 +164,32 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         return policy
 
 
-def _monitor(config: MonitorConfig, device: str, features: dict) -> Monitor:
-    from lerobot_roborecover.interventions.monitor_loading import load_monitor
+def _monitor(config: MonitorConfig, device: str, features: dict, probe: PolicyProbe) -> Detector:
+    from lerobot_roborecover.interventions.detectors.loading import check_needs, load_detector
 
     overrides = {} if config.threshold is None else {"threshold": str(config.threshold)}
     if config.base_model:
         overrides["base_model"] = config.base_model
-    monitor = load_monitor(config.path, device, revision=config.revision, **overrides)
-    missing = sorted(set(monitor.input_features) - set(features)) if features else []
-    if missing:
+    detector = load_detector(config.path, device, revision=config.revision, **overrides)
+    option = f"--policy.monitor.path={config.path}"
+    if isinstance(detector, DetectorRewardModel | ProgressDetector):
+        settings = detector.config if isinstance(detector, DetectorRewardModel) else detector.options
+        if not getattr(detector, "fitted", True):
+            raise OptionError(
+                f"{option}: has not been fitted; `roborecover eval-monitor --detector` fits and saves it"
+            )
+        if settings.threshold is None:
+            raise OptionError(
+                f"{option}: has no threshold, and would never trigger. Give --policy.monitor.threshold, or "
+                "the folder that `roborecover eval-monitor --detector` saved, which has one"
+            )
+    missing = sorted(set(detector.needs.features) - set(features)) if features else []
+    if missing and isinstance(detector, MonitorDetector):
         raise OptionError(
-            f"--policy.monitor.path={config.path}: was trained on {sorted(monitor.input_features)}; the "
+            f"{option}: was trained on {sorted(detector.needs.features)}; the "
             f"environment gives no {missing[0]}, only {sorted(features)}. See --env.obs_type"
         )
-    return monitor
+    if features or detector.needs.truth or detector.needs.of_policy:
+        there = features or dict.fromkeys(detector.needs.features)
+        check_needs(option, detector.needs, there, probe)
+    return detector

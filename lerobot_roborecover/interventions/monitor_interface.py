@@ -28,7 +28,8 @@ class Verdicts:
     """What a monitor said of B observations."""
 
     scores: np.ndarray
-    """(B,) float32 in [0, 1]: how far the execution has gone wrong; NaN where the answer is unparsable."""
+    """(B,) float32: how far the execution has gone wrong, from monitors in [0, 1], from other detectors on
+    their own scale; NaN where the answer is unparsable."""
     triggers: np.ndarray
     """(B,) bool: intervene now. Never True where the score is NaN."""
 
