@@ -9,11 +9,13 @@ from types import TracebackType
 from lerobot_roborecover.env import configs  # noqa: F401 - registers the env types
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.interventions import configuration_intervention, ema  # noqa: F401 - register types
+from lerobot_roborecover.interventions.detectors import register_detectors
 from lerobot_roborecover.interventions.monitor import register_monitors
 from lerobot_roborecover.platforms.base import ENV_PREFIX
 from lerobot_roborecover.remote import configuration_remote  # noqa: F401 - registers the policy
 
 register_monitors()
+register_detectors()
 
 
 def rewrite_env_argument(argv: list[str]) -> list[str]:

@@ -8,22 +8,24 @@ import sys
 from pathlib import Path
 
 HELP = (
-    "Measure a trained monitor on held-out frames: accuracy, precision, recall, F1, Macro-F1, FPR, confusion "
-    "counts, curves, trigger rate and detection delay, with intervals over scenarios."
+    "Measure a trained monitor on held-out frames (--monitor, --data): accuracy, precision, recall, F1, "
+    "Macro-F1, FPR, confusion counts, curves, trigger rate and detection delay. Or compare detectors side by "
+    "side on a policy's own trials (--detector, --scenarios, --policy): who needs help, delays, false alarms "
+    "a minute, calibration, conformal thresholds, cost. With intervals over scenarios."
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add = parser.add_argument
-    add("--monitor", required=True, help="checkpoint: folder or Hub id")
+    add("--monitor", help="checkpoint: folder or Hub id")
     add("--revision", help="commit, tag or branch of a Hub id")
     add(
-        "--data", action="append", required=True, metavar="[NAME=]DIR",
+        "--data", action="append", metavar="[NAME=]DIR",
         help="frames of `roborecover monitor-data`; may be given again",
     )  # fmt: skip
     add("--out", type=Path, default=Path("outputs/monitor"), help="folder of the report (%(default)s)")
-    add("--device", help="where the monitor runs")
+    add("--device", help="where the monitor, the policy and the detectors run")
     add("--base-model", help="base of the Qwen3-VL monitor, where its checkpoint names another place")
     add("--threshold", type=float, help="decide by score > THRESHOLD instead of the monitor's own answer")
     add(
@@ -38,10 +40,122 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--draws", type=int, default=10_000, help="without effect: the intervals need no draws")
     add("--seed", type=int, default=0, help="without effect, likewise")
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
+    side = parser.add_argument_group("detectors side by side")
+    add = side.add_argument
+    add(
+        "--detector", action="append", metavar="[NAME=]WHAT[,OPTION=VALUE...]",
+        help="a checkpoint of a monitor, of a saved detector or of a LeRobot reward model; or "
+        "chunk_disagreement, constant, elapsed, no_progress, oracle, policy_features, state_distance; may be "
+        "given again",
+    )  # fmt: skip
+    add("--scenarios", help="scenario set: folder, Hub id or shipped name")
+    add("--policy", metavar="CHECKPOINT", help="who acts in the trials, and is watched")
+    add("--scenarios-revision", metavar="REVISION", help="commit, tag or branch of the set on the Hub")
+    add("--split", default="test", help="scenarios that are measured on (%(default)s)")
+    add(
+        "--fit-split", default="train",
+        help="scenarios whose trials policy_features and state_distance are fitted to (%(default)s)",
+    )  # fmt: skip
+    add("--select", default="", help="which scenarios, e.g. 'suite=hard; source=natural'")
+    add("--trials", type=int, default=1, help="of each scenario, from each start (%(default)s)")
+    add("--run-seed", type=int, default=1000, help="of the trials (%(default)s)")
+    add(
+        "--training-data", type=Path, metavar="DIR",
+        help="LeRobotDataset that the policy was trained on, for state_distance (successful clean rollouts)",
+    )  # fmt: skip
+    add(
+        "--alpha", type=float, default=0.1,
+        help="chance of a false alarm in a clean rollout that conformal thresholds allow (%(default)s)",
+    )  # fmt: skip
+    add("--films", type=int, default=3, help="trials shown as film strips; 0 renders none (%(default)s)")
+    add("--work", type=Path, help="folder of trials and observations, kept between runs (OUT.work)")
+    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add(
+        "--env", action="append", default=[], metavar="NAME=VALUE",
+        help="option of the recovery env type, e.g. obs_type=state; may be given again",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Judges, computes, writes and prints."""
+    from lerobot_roborecover.interventions.monitor.errors import MonitorError
+
+    frames, side = ("monitor", "data"), ("detector", "scenarios", "policy")
+    wanted, others = (side, frames) if args.detector else (frames, side)
+    missing = [name for name in wanted if not getattr(args, name)]
+    clash = [name for name in others if getattr(args, name)]
+    if missing or clash:
+        what = f"--{missing[0]} is missing" if missing else f"--{clash[0]} does not belong to --{wanted[0]}"
+        raise MonitorError(
+            f"{what}. Give --monitor and --data to measure a monitor on frames; or --detector, --scenarios "
+            "and --policy to compare detectors on a policy's trials"
+        )
+    return _side_by_side(args) if args.detector else _on_frames(args)
+
+
+def _side_by_side(args: argparse.Namespace) -> int:
+    """Detectors on a policy's trials."""
+    from lerobot_roborecover import __version__
+    from lerobot_roborecover.analysis.detection_page import detection_text, write_detection_report
+    from lerobot_roborecover.curation.detection.request import DetectionRequest, compare_detectors
+    from lerobot_roborecover.curation.detection.strips import choose_trials, film_strips
+    from lerobot_roborecover.curation.detection.trials import TrialSource
+    from lerobot_roborecover.progress import Progress
+
+    source = TrialSource(
+        scenarios=args.scenarios,
+        policy=args.policy,
+        work=args.work or args.out.with_name(f"{args.out.name}.work"),
+        revision=args.scenarios_revision,
+        select=args.select,
+        env=args.env,
+        trials=args.trials,
+        run_seed=args.run_seed,
+        device=args.device,
+        workers=args.workers,
+    )
+    request = DetectionRequest(
+        detectors=args.detector,
+        source=source,
+        split=args.split,
+        fit_split=args.fit_split,
+        training_data=args.training_data,
+        alpha=args.alpha,
+        on_training_scenarios=args.on_training_scenarios,
+        device=args.device,
+        base_model=args.base_model,
+        level=args.level,
+        seed=args.seed,
+    )
+    found = compare_detectors(request, args.out, Progress("trial").of)
+    strips, problem = film_strips(found.trials, choose_trials(found.trials, args.films))
+    remarks = [*found.remarks, *([f"no pictures: {problem}"] if problem else [])]
+    remarks += [f"left out {n}: {reason}" for reason, n in found.dropped.most_common()]
+    about = {
+        "policy": args.policy,
+        "scenarios": f"{args.scenarios}, split {args.split}",
+        "trials": f"{len(found.trials)}, {args.trials} of each scenario from each start",
+        "false-alarm rate": f"{args.alpha:g} a clean rollout",
+        "package": __version__,
+        "command": shlex.join(["roborecover", *sys.argv[1:]]),
+        **({"remarks": "; ".join(remarks)} if remarks else {}),
+    }
+    page = write_detection_report(
+        args.out, found.measured, found.scored, strips, alpha=args.alpha, level=args.level, seed=args.seed,
+        about=about,
+    )  # fmt: skip
+    print(detection_text(found.measured, args.alpha, args.level))
+    for remark in remarks:
+        print(f"\nnote: {remark}", file=sys.stderr)
+    for m in found.measured:
+        if m.saved:
+            print(f"use it: --policy.monitor.path={m.saved}")
+    print(f"\npage {page}\nnumbers {args.out / 'detectors.json'}")
+    return 0
+
+
+def _on_frames(args: argparse.Namespace) -> int:
+    """One monitor on labelled frames."""
     from lerobot_roborecover import __version__
     from lerobot_roborecover.analysis.monitor_curves import choose_threshold
     from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, write_monitor_report

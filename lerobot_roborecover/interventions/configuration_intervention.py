@@ -30,7 +30,8 @@ class MonitorConfig:
     """The recovery monitor, or any other detector."""
 
     path: str = ""
-    """Folder or Hub id; or a kind of detector with its options, e.g. `no_progress,steps=30` (docs/detectors.md)."""
+    """Folder or Hub id; or a kind of detector with its options, e.g. `no_progress,steps=30,threshold=0.9`
+    (docs/detectors.md)."""
     revision: str | None = None
     """Commit, tag or branch of a Hub checkpoint."""
     threshold: float | None = None

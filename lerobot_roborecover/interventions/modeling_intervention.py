@@ -58,8 +58,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
                     f"--policy.correction.path={config.correction.path}: its actions and those of the base "
                     f"policy have widths {sorted(widths)}; they must be of one action space"
                 )
-        base, preprocessor, _ = members[Controller.BASE].parts
-        probe = PolicyProbe(base, preprocessor)
+        probe = PolicyProbe(*members[Controller.BASE].parts[:2])
         monitor = _monitor(config.monitor, str(config.device), features, probe) if config.monitored else None
         self.director = Director(
             members,
@@ -173,7 +172,7 @@ def _monitor(config: MonitorConfig, device: str, features: dict, probe: PolicyPr
     detector = load_detector(config.path, device, revision=config.revision, **overrides)
     option = f"--policy.monitor.path={config.path}"
     if isinstance(detector, DetectorRewardModel | ProgressDetector):
-        settings = detector.config if isinstance(detector, DetectorRewardModel) else detector.options
+        settings: Any = detector.config if isinstance(detector, DetectorRewardModel) else detector.options
         if not getattr(detector, "fitted", True):
             raise OptionError(
                 f"{option}: has not been fitted; `roborecover eval-monitor --detector` fits and saves it"

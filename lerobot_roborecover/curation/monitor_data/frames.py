@@ -28,6 +28,8 @@ class RenderJob:
     """(n, A) after the prefix."""
     steps: np.ndarray
     """(k,) increasing, of the prefix and the actions together."""
+    prefix_steps: int | None = None
+    """So many actions of the prefix come first, where a trial began before the recovery point; None: all."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def film(simulator: Simulator, job: RenderJob) -> RenderedSteps:
     simulator.reset(job.scenario.task, job.scenario.reset)
     seen, progress = [], []
     # Each action in its own type: the prefix in float64, the others as the policy gave them.
-    for step in follow(simulator, chain(job.scenario.prefix, job.actions)):
+    for step in follow(simulator, chain(job.scenario.prefix[: job.prefix_steps], job.actions)):
         if step in wanted:
             seen.append(simulator.observe())
             progress.append(simulator.progress() if isinstance(simulator, ShowsProgress) else np.nan)

@@ -45,7 +45,9 @@ class DetectorConfig(RewardModelConfig):
 
     def refuse(self, name: str, limit: str) -> MonitorError:
         """The refusal of an option's value."""
-        return MonitorError(f"{self.type.removeprefix(PREFIX)}, {name}={getattr(self, name)}: must be {limit}")
+        return MonitorError(
+            f"{self.type.removeprefix(PREFIX)}, {name}={getattr(self, name)}: must be {limit}"
+        )
 
 
 class DetectorRewardModel(PreTrainedRewardModel):
@@ -54,6 +56,7 @@ class DetectorRewardModel(PreTrainedRewardModel):
     # LeRobot declares both as None, for subclasses to replace.
     config_class: type[RewardModelConfig] = DetectorConfig  # ty: ignore[incompatible-attribute-override]
     name: str = "roborecover_detector"  # ty: ignore[incompatible-attribute-override]
+    config: Any
     fitted: bool = True
     """Whether it can be asked: False for one that has to be fitted first, and has not been."""
 
@@ -125,4 +128,3 @@ class DetectorRewardModel(PreTrainedRewardModel):
     def fill(self, name: str, value: Tensor) -> None:
         """Sets a buffer, whatever its shape was."""
         self.register_buffer(name, value.detach().clone().float())
-

@@ -8,8 +8,8 @@ Contract with whoever implements one:
   of the policy that acts, the policy's own features, or a truth that nobody knows while a trial runs.
 - A higher score means "needs help" more. A score of NaN says nothing, and never triggers.
 
-A recovery monitor (`monitor_interface.Monitor`), which judges one observation at a time, is a detector through
-`MonitorDetector`.
+A recovery monitor (`monitor_interface.Monitor`), which judges one observation at a time, is a detector
+through `MonitorDetector`.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ FEATURE_MODULES: Mapping[str, str] = {
     "pi0": "model.action_out_proj",
     "pi05": "model.action_out_proj",
 }
-"""By policy type of LeRobot 0.6.1: the module that turns features into actions. What goes into it, at its last
-call of an inference (the last denoising step), is what `policy_features` reads."""
+"""By policy type of LeRobot 0.6.1: the module that turns features into actions. What goes into it, at its
+last call of an inference (the last denoising step), is what `policy_features` reads."""
 _CHANNELS_FIRST = ("diffusion",)
 _QUEUED = ("diffusion",)
 """Types that read their last `n_obs_steps` observations, and take them as (B, n_obs_steps, ...)."""
@@ -40,14 +40,15 @@ class PolicyProbe:
 
     def __init__(self, policy: Any, preprocessor: Any):
         self._policy, self._pre = policy, preprocessor
-        self._kind = getattr(policy.config, "type", "")
+        self.kind = getattr(policy.config, "type", "")
+        """The policy's type."""
         self._device = next(policy.parameters()).device
-        self._noise = STATELESS.get(self._kind, "inside")
+        self._noise = STATELESS.get(self.kind, "inside")
 
     @property
     def past(self) -> int:
         """Observations before the last that the policy reads."""
-        return int(self._policy.config.n_obs_steps) - 1 if self._kind in _QUEUED else 0
+        return int(self._policy.config.n_obs_steps) - 1 if self.kind in _QUEUED else 0
 
     @property
     def deterministic(self) -> bool:
@@ -62,14 +63,14 @@ class PolicyProbe:
             MonitorError: naming the detector, the policy type and the types that can.
         """
         chunks = sorted({*STATELESS, *_QUEUED})
-        if needs.chunks and self._kind not in chunks:
+        if needs.chunks and self.kind not in chunks:
             raise MonitorError(
-                f"{name} needs the policy's action chunks; a {self._kind!r} policy gives none beside a trial. "
+                f"{name} needs the policy's action chunks; a {self.kind!r} policy gives none beside a trial. "
                 f"It works with {chunks}"
             )
-        if needs.internals and self._kind not in FEATURE_MODULES:
+        if needs.internals and self.kind not in FEATURE_MODULES:
             raise MonitorError(
-                f"{name} needs the policy's own features; where a {self._kind!r} policy has them is not known "
+                f"{name} needs the policy's own features; where a {self.kind!r} policy has them is not known "
                 f"(interventions/detectors/probe.py). It works with {sorted(FEATURE_MODULES)}"
             )
 
@@ -93,7 +94,6 @@ class PolicyProbe:
         Returns:
             B pairs: (K, H, A) chunks as predicted, and (F,) features; None for what is not asked.
         """
-        samples = 1 if self.deterministic else max(needs.chunks, 1)
         if self.deterministic:
             chunks, features = self._infer(windows, instructions, 1, None)
             return [
@@ -131,20 +131,20 @@ class PolicyProbe:
         if not seen:
             return chunks, torch.zeros(len(chunks), 0)
         last = seen[-1].float().cpu()
-        if self._kind in _CHANNELS_FIRST:
+        if self.kind in _CHANNELS_FIRST:
             last = last.movedim(1, -1)
         return chunks, last.flatten(1, -2).mean(1)
 
     def _batch(self, windows: Sequence[Sequence[Mapping[str, Tensor]]], copies: int) -> dict[str, Tensor]:
         keys = windows[0][-1]
-        if self._kind not in _QUEUED:
+        if self.kind not in _QUEUED:
             rows = {k: torch.stack([w[-1][k] for w in windows]) for k in keys}
         else:
             rows = {k: torch.stack([_last(w, k, self.past + 1) for w in windows]) for k in keys}
         return {k: v.repeat_interleave(copies, 0) for k, v in rows.items()}
 
     def _module(self) -> nn.Module | None:
-        path = FEATURE_MODULES.get(self._kind)
+        path = FEATURE_MODULES.get(self.kind)
         return self._policy.get_submodule(path) if path else None
 
 

@@ -155,8 +155,9 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
             f"{_parts(config)}; without a network these must be in the Hub's cache already (`hf download`)"
         ) from err
     for step in pre.steps:
-        if hasattr(step, "eval"):  # SARM's would play film backwards and change the instruction
-            step.eval()
+        to_eval = getattr(step, "eval", None)
+        if callable(to_eval):  # SARM's would play film backwards and change the instruction
+            to_eval()
     model.eval()
     return ProgressDetector(model, pre, options)
 

@@ -1,0 +1,130 @@
+"""Fits the detectors that learn: the distance from training states, and the network on the policy's features.
+
+Both are fitted to trials of the policy that acts, on scenarios that nothing is measured on; the states rather
+to the policy's own training set, where that is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_roborecover.curation.detection.scoring import PolicyLooks
+from lerobot_roborecover.curation.detection.trials import SeenTrial
+from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds
+from lerobot_roborecover.interventions.detectors.modeling_policy import RoboRecoverPolicyFeaturesRewardModel
+from lerobot_roborecover.interventions.detectors.modeling_states import (
+    RoboRecoverStateDistanceRewardModel,
+)
+from lerobot_roborecover.interventions.monitor.errors import MonitorError
+
+
+def fit_states(
+    detector: RoboRecoverStateDistanceRewardModel, trials: Sequence[SeenTrial], training_data: Path | None
+) -> str:
+    """Fits it to a training set, else to clean rollouts that succeed.
+
+    Args:
+        detector: not fitted yet.
+        trials: for where there is no training set.
+        training_data: LeRobotDataset that the policy was trained on.
+
+    Returns:
+        What it was fitted to, in words.
+
+    Raises:
+        MonitorError: there are no such states.
+    """
+    keys = detector.config.key_list
+    if training_data is not None:
+        states, texts = training_states(training_data, keys)
+        detector.fit(states, texts)
+        return f"{len(texts)} frames of {training_data}"
+    chosen = [t for t in trials if t.row.start == "initial" and t.row.success]
+    if not chosen:
+        raise MonitorError(
+            "state_distance: no clean rollout of the fitting split succeeds. Give the policy's own training "
+            "set with --training-data, or another --fit-split"
+        )
+    states = {
+        k: torch.from_numpy(np.concatenate([t.observations[k][t.segments[-1]] for t in chosen])) for k in keys
+    }
+    texts = [t.scenario.task.instruction for t in chosen for _ in range(len(t.actions))]
+    detector.fit(states, texts)
+    _remember(detector, chosen)
+    return f"{len(texts)} steps of {len(chosen)} successful clean rollouts"
+
+
+def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Tensor], list[str]]:
+    """States of a LeRobotDataset, and the instruction of each.
+
+    Args:
+        root: folder of it.
+        keys: columns.
+
+    Raises:
+        MonitorError: it lacks one.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    if not (root / "meta" / "info.json").is_file():
+        raise MonitorError(f"--training-data {root}: no LeRobotDataset there (it has no meta/info.json)")
+    dataset: Any = LeRobotDataset(f"local/{root.resolve().name}", root=root)
+    missing = [k for k in keys if k not in dataset.features]
+    if missing:
+        raise MonitorError(
+            f"--training-data {root}: has no {missing[0]}, only "
+            f"{sorted(k for k in dataset.features if k.startswith('observation'))}. Name others with "
+            "state_distance,keys=..."
+        )
+    table = dataset.hf_dataset.with_format("numpy")
+    states = {k: torch.from_numpy(np.stack(table[k][:]).astype(np.float32)) for k in keys}
+    names = {int(row["task_index"]): str(text) for text, row in dataset.meta.tasks.iterrows()}
+    return states, [names[int(i)] for i in np.asarray(table["task_index"][:]).reshape(-1)]
+
+
+def fit_features(
+    detector: RoboRecoverPolicyFeaturesRewardModel, trials: Sequence[SeenTrial], looks: PolicyLooks
+) -> str:
+    """Fits it to whether the policy goes on by itself: 1 from the recovery point on in a trial that fails, 0
+    in one that succeeds and in clean rollouts that do.
+
+    Args:
+        detector: not fitted yet.
+        trials: of scenarios that nothing is measured on.
+        looks: into the policy.
+
+    Returns:
+        What it was fitted to, in words.
+
+    Raises:
+        MonitorError: one of the labels is missing.
+    """
+    features, labels, used = [], [], []
+    needs = DetectorNeeds(internals=True)
+    for trial in trials:
+        if trial.row.start == "initial" and not trial.row.success:
+            continue
+        steps = looks.of(trial, needs)[-1]
+        rows = torch.stack([f for _, f in steps if f is not None])
+        features.append(rows)
+        labels.append(torch.full((len(rows),), float(not trial.row.success)))
+        used.append(trial)
+    if not used:
+        raise MonitorError("policy_features: the fitting split has no usable trial. Name another --fit-split")
+    detector.fit(torch.cat(features), torch.cat(labels))
+    _remember(detector, used)
+    counts: Mapping[str, int] = detector.config.labels
+    return f"{counts['1']} steps that need help and {counts['0']} that do not, of {len(used)} trials"
+
+
+def _remember(detector: Any, trials: Sequence[SeenTrial]) -> None:
+    detector.trained_on = {
+        "dataset": "trials of the policy that acts",
+        "labels": dict(getattr(detector.config, "labels", {})),
+        "scenarios": {t.scenario.id: t.scenario.sha256() for t in trials},
+    }
