@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="scenarios whose trials policy_features and state_distance are fitted to (%(default)s)",
     )  # fmt: skip
     add("--select", default="", help="which scenarios, e.g. 'suite=hard; source=natural'")
+    add("--fit-select", help="the same of --fit-split alone (as --select)")
     add("--trials", type=int, default=1, help="of each scenario, from each start (%(default)s)")
     add("--run-seed", type=int, default=1000, help="of the trials (%(default)s)")
     add(
@@ -119,6 +120,7 @@ def _side_by_side(args: argparse.Namespace) -> int:
         source=source,
         split=args.split,
         fit_split=args.fit_split,
+        fit_select=args.fit_select,
         training_data=args.training_data,
         alpha=args.alpha,
         on_training_scenarios=args.on_training_scenarios,

@@ -54,6 +54,8 @@ class DetectionRequest:
     split: str = "test"
     fit_split: str = "train"
     """Scenarios whose trials detectors that learn are fitted to."""
+    fit_select: str | None = None
+    """Which of them; None takes those that `source.select` takes."""
     training_data: Path | None = None
     """LeRobotDataset that the policy was trained on, for the distance from training states."""
     alpha: float = 0.1
@@ -222,7 +224,10 @@ def _fit(
                 f"--fit-split {request.fit_split} is what is measured on; detectors that learn "
                 f"({', '.join(n.name for n in todo)}) are fitted to other scenarios"
             )
-        trials, _ = see_trials(request.source, request.fit_split, host.env_batch, progress)
+        source = request.source
+        if request.fit_select is not None:
+            source = replace(source, select=request.fit_select)
+        trials, _ = see_trials(source, request.fit_split, host.env_batch, progress)
     for n in todo:
         if isinstance(n.detector, RoboRecoverStateDistanceRewardModel):
             n.fitted_to = fit_states(n.detector, trials, request.training_data)
