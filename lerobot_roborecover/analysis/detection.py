@@ -165,9 +165,10 @@ def _labels(trial: ScoredTrial, label: str) -> np.ndarray:
 
 
 def rank(trials: Sequence[ScoredTrial], label: str, level: float = LEVEL) -> Ranking | None:
-    """Curves of a label's frames, with intervals of their areas over units; None without both kinds."""
+    """Curves of a label's frames, with intervals of their areas over units; None where it has not said
+    anything of both kinds."""
     frames = frames_of(trials, label)
-    if frames is None:
+    if frames is None or len(set(frames.label[frames.parsed].tolist())) < 2:
         return None
     row = np.unique(frames.scenario, return_inverse=True)[1]
     return Ranking(

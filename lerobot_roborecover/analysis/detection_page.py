@@ -106,7 +106,7 @@ def alarm_table(measured: Sequence[MeasuredDetector], alpha: float) -> Table:
 
 def _alarm_row(name: str, alarms: Alarms) -> tuple[Cell, ...]:
     steps, seconds = alarms.median_delay
-    shown = " / ".join(finite(t, ".3g") for t in alarms.threshold) or "its own"
+    shown = " / ".join(finite(t, ".4g") for t in alarms.threshold) or "its own"
     return (
         name, shown, alarms.clean_alarmed, alarms.alarms_per_minute, alarms.detected, alarms.helped,
         alarms.needless, steps, seconds,

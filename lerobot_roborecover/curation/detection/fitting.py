@@ -59,6 +59,19 @@ def fit_states(
     return f"{len(texts)} steps of {len(chosen)} successful clean rollouts"
 
 
+def check_training_data(root: Path) -> None:
+    """Refuses a folder that is no LeRobotDataset.
+
+    Raises:
+        MonitorError: naming it.
+    """
+    if not (root / "meta" / "info.json").is_file():
+        raise MonitorError(
+            f"--training-data {root}: no LeRobotDataset there (it has no meta/info.json). Give the folder of "
+            "one, downloaded from the Hub or recorded"
+        )
+
+
 def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Tensor], list[str]]:
     """States of a LeRobotDataset, and the instruction of each.
 
@@ -71,8 +84,7 @@ def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Te
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    if not (root / "meta" / "info.json").is_file():
-        raise MonitorError(f"--training-data {root}: no LeRobotDataset there (it has no meta/info.json)")
+    check_training_data(root)
     dataset: Any = LeRobotDataset(f"local/{root.resolve().name}", root=root)
     missing = [k for k in keys if k not in dataset.features]
     if missing:

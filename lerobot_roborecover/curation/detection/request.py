@@ -13,7 +13,7 @@ from lerobot_roborecover.analysis.conformal import least_rollouts
 from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
 from lerobot_roborecover.analysis.detection_page import MeasuredDetector
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.curation.detection.fitting import fit_features, fit_states
+from lerobot_roborecover.curation.detection.fitting import check_training_data, fit_features, fit_states
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks, cost_ms, score_trials
 from lerobot_roborecover.curation.detection.trials import SeenTrial, TrialSource, see_trials
 from lerobot_roborecover.curation.monitor_data.data import check_disjoint
@@ -138,6 +138,7 @@ def compare_detectors(
     if not request.on_training_scenarios:
         for n in named:
             _check_held_out(n, links)
+    _check_fitting(named, request)
     host, features = _host(request, scenarios.platform)
     policy, pre, _ = host.parts
     probe = PolicyProbe(policy, pre)
@@ -202,6 +203,24 @@ def _check_held_out(named: NamedDetector, links: Sequence[ScenarioLink]) -> None
     check_disjoint(trained, links, f"--detector {named.name}")
 
 
+def _learns_from_trials(named: NamedDetector, request: DetectionRequest) -> bool:
+    learns = not getattr(named.detector, "fitted", True)
+    of_states = isinstance(named.detector, RoboRecoverStateDistanceRewardModel)
+    return learns and not (of_states and request.training_data is not None)
+
+
+def _check_fitting(named: Sequence[NamedDetector], request: DetectionRequest) -> None:
+    """Refuses to fit to what is measured on, or to a training set that is not there; before anything runs."""
+    learning = [n.name for n in named if _learns_from_trials(n, request)]
+    if learning and request.fit_split == request.split:
+        raise ScenarioError(
+            f"--fit-split {request.fit_split} is what is measured on; detectors that learn "
+            f"({', '.join(learning)}) are fitted to other scenarios"
+        )
+    if request.training_data is not None:
+        check_training_data(request.training_data)
+
+
 def _fit(
     named: Sequence[NamedDetector],
     request: DetectionRequest,
@@ -211,19 +230,8 @@ def _fit(
     progress: Callable[[str, int, int], None],
 ) -> None:
     todo = [n for n in named if not getattr(n.detector, "fitted", True)]
-    needs_trials = any(
-        isinstance(n.detector, RoboRecoverPolicyFeaturesRewardModel) or request.training_data is None
-        for n in todo
-    )
-    if not todo:
-        return
     trials: list[SeenTrial] = []
-    if needs_trials:
-        if request.fit_split == request.split:
-            raise ScenarioError(
-                f"--fit-split {request.fit_split} is what is measured on; detectors that learn "
-                f"({', '.join(n.name for n in todo)}) are fitted to other scenarios"
-            )
+    if any(_learns_from_trials(n, request) for n in todo):
         source = request.source
         if request.fit_select is not None:
             source = replace(source, select=request.fit_select)
