@@ -128,7 +128,8 @@ def _reliability(reports: Reports) -> Figure:
 
 def _finish(axes, place: str) -> None:
     axes.grid(color=LINE, lw=0.6)
-    axes.legend(loc=place, fontsize=8)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc=place, fontsize=8)
 
 
 def strip_figure(
