@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from lerobot_roborecover.env.directives import BY_RULE, Controller, Directive, attach
-from lerobot_roborecover.interventions.detectors.interface import Detector, Watch, as_detector
+from lerobot_roborecover.interventions.detectors.interface import Detector, TrialWatch, as_detector
 from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
 from lerobot_roborecover.interventions.detectors.watching import Watcher
 from lerobot_roborecover.interventions.driver import Driver
@@ -54,7 +54,7 @@ class DirectedTrial:
     """Steps that the correction policy still has."""
     first: Directive = field(default_factory=Directive)
     """What is to stand beside the next action."""
-    watch: Watch | None = None
+    watch: TrialWatch | None = None
     """What the monitor has seen of it; None without one."""
 
 

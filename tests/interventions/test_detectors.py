@@ -29,10 +29,13 @@ def walk_of(steps: int, seed: int = 0) -> list[dict]:
 
 
 def windows(observations, past: int, *, text: str = "go", seed: int = 7, **known) -> list:
-    from lerobot_roborecover.interventions.detectors.interface import Glimpse, Window
+    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
 
     glimpses = [Glimpse(o) for o in observations]
-    return [Window(glimpses[max(n - past, 0) : n + 1], text, n, seed, **known) for n in range(len(glimpses))]
+    return [
+        DetectorWindow(glimpses[max(n - past, 0) : n + 1], text, n, seed, **known)
+        for n in range(len(glimpses))
+    ]
 
 
 def load(what: str, **options):
@@ -139,14 +142,14 @@ def test_states_are_compared_within_their_task():
 def test_chunks_that_contradict_each_other():
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import Glimpse, Window
+    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
 
     detector = load("chunk_disagreement,lag=1,samples=2")
     line = torch.arange(5.0)
 
     def score(before, now):
         glimpses = [Glimpse({}, c[:, :, None]) for c in (before, now)]
-        return float(detector.judge_windows([Window(glimpses, "go", 1)]).scores[0])
+        return float(detector.judge_windows([DetectorWindow(glimpses, "go", 1)]).scores[0])
 
     same = line.expand(2, 5)
     assert score(same, same + 1) == pytest.approx(0.0)  # the plan goes on as it was
@@ -155,7 +158,10 @@ def test_chunks_that_contradict_each_other():
     # Undecided between two ways, both times alike: no contradiction.
     two = torch.stack([line, -line])
     assert score(two, torch.stack([line + 1, -line - 1])) == pytest.approx(0.0, abs=1e-6)
-    assert float(detector.judge_windows([Window([Glimpse({}, two[:, :, None])], "go", 0)]).scores[0]) == 0.0
+    assert (
+        float(detector.judge_windows([DetectorWindow([Glimpse({}, two[:, :, None])], "go", 0)]).scores[0])
+        == 0.0
+    )
     with pytest.raises(MonitorError, match=r"lag=1: the policy's chunks have 1 steps.*Set lag below 1"):
         score(torch.zeros(2, 1), torch.zeros(2, 1))
 
@@ -195,7 +201,7 @@ def test_looking_into_a_policy_touches_nothing_and_depends_on_nothing_else(kind,
 def test_a_network_on_features_learns_and_comes_back(tmp_path):
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import Glimpse, Window
+    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
 
     rng = np.random.default_rng(0)
     labels = torch.from_numpy((np.arange(400) % 4 == 0).astype(np.float32))
@@ -205,7 +211,7 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
     state = torch.get_rng_state()
     detector.fit(features, labels)
     assert torch.equal(torch.get_rng_state(), state)
-    asked = [Window([Glimpse({}, None, f)], "go", 0) for f in features]
+    asked = [DetectorWindow([Glimpse({}, None, f)], "go", 0) for f in features]
     said = detector.judge_windows(asked).scores
     assert said[labels == 1].mean() > 0.7 > 0.4 > said[labels == 0].mean()
     detector.save_pretrained(tmp_path)
@@ -213,13 +219,13 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
     with pytest.raises(MonitorError, match="400 frames where the policy goes on by itself and 0"):
         load("policy_features").fit(features, torch.zeros(400))
     with pytest.raises(MonitorError, match="fitted to 8 features; the policy has 3"):
-        detector.judge_windows([Window([Glimpse({}, None, torch.zeros(3))], "go", 0)])
+        detector.judge_windows([DetectorWindow([Glimpse({}, None, torch.zeros(3))], "go", 0)])
 
 
 @pytest.mark.parametrize("kind", ["act", "diffusion"])
 def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
     """A detector beside trials under way, in a batch with another one, against windows made afterwards."""
-    from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds, Glimpse, Window
+    from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds, DetectorWindow, Glimpse
     from lerobot_roborecover.interventions.detectors.watching import Watcher, noise_seed
 
     detector = load("chunk_disagreement,lag=2,samples=2")
@@ -239,7 +245,7 @@ def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
         ]
         glimpses = [Glimpse(o, c) for o, c in zip(walk, chunks, strict=True)]
         after = detector.judge_windows(
-            [Window(glimpses[max(n - 2, 0) : n + 1], "go", n, seed) for n in range(7)]
+            [DetectorWindow(glimpses[max(n - 2, 0) : n + 1], "go", n, seed) for n in range(7)]
         )
         np.testing.assert_allclose([row[at] for row in live], after.scores, rtol=1e-4, atol=1e-6)
         assert after.scores[6] > 0

@@ -38,12 +38,12 @@ def film(steps: int, size: int = 64) -> list[dict]:
 
 def ask(detector, seen, steps):
     """What it says at the steps, each with its own history."""
-    from lerobot_roborecover.interventions.detectors.interface import Glimpse, Window
+    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
 
     glimpses = [Glimpse(o) for o in seen]
     past = detector.needs.past
     return detector.judge_windows(
-        [Window(glimpses[max(n - past, 0) : n + 1], "push the puck", n) for n in steps]
+        [DetectorWindow(glimpses[max(n - past, 0) : n + 1], "push the puck", n) for n in steps]
     )
 
 

@@ -16,8 +16,8 @@ from lerobot_roborecover.curation.detection.trials import SeenTrial
 from lerobot_roborecover.interventions.detectors.interface import (
     Detector,
     DetectorNeeds,
+    DetectorWindow,
     Glimpse,
-    Window,
     scores_of,
 )
 from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
@@ -78,7 +78,7 @@ def observations_of(trial: SeenTrial, segment: slice) -> list[dict[str, Tensor]]
     return [{k: v[n] for k, v in arrays.items()} for n in range(segment.stop - segment.start)]
 
 
-def windows_of(trial: SeenTrial, needs: DetectorNeeds, looks: PolicyLooks) -> list[list[Window]]:
+def windows_of(trial: SeenTrial, needs: DetectorNeeds, looks: PolicyLooks) -> list[list[DetectorWindow]]:
     """By segment of the trial, what a detector is asked about at each of its steps."""
     found = []
     for segment, looked in zip(trial.segments, looks.of(trial, needs), strict=True):
@@ -95,7 +95,7 @@ def windows_of(trial: SeenTrial, needs: DetectorNeeds, looks: PolicyLooks) -> li
             helpless = float(not trial.row.success)
         found.append(
             [
-                Window(
+                DetectorWindow(
                     glimpses[max(n - needs.past, 0) : n + 1], trial.scenario.task.instruction, n,
                     trial.row.trial_seed or 0, deviated, helpless,
                 )
@@ -161,7 +161,7 @@ def cost_ms(detector: Detector, trials: Sequence[SeenTrial], probe: PolicyProbe 
             ]
         else:
             asked = 0.0
-        window = Window(glimpses, text, n, seed, 0.0, 0.0)
+        window = DetectorWindow(glimpses, text, n, seed, 0.0, 0.0)
         began = time.perf_counter()
         detector.judge_windows([window])
         spent.append(asked + time.perf_counter() - began)

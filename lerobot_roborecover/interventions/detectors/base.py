@@ -14,7 +14,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds, Window, batch_of
+from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds, DetectorWindow, batch_of
 from lerobot_roborecover.interventions.monitor.base import TRAINED_ON_FILE
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
 from lerobot_roborecover.interventions.monitor.files import WEIGHTS_FILE, find_file, read_trained_on
@@ -82,7 +82,7 @@ class DetectorRewardModel(PreTrainedRewardModel):
         return self.config.max_batch
 
     @torch.inference_mode()
-    def judge_windows(self, windows: Sequence[Window]) -> Verdicts:
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
         """Scores, and which of them are above the threshold."""
         scores = self.compute_reward(batch_of(windows, self.needs)).float().cpu().numpy()
         threshold = self.config.threshold

@@ -80,7 +80,7 @@ class Glimpse:
 
 
 @dataclass(frozen=True)
-class Window:
+class DetectorWindow:
     """What a detector is asked about."""
 
     glimpses: Sequence[Glimpse]
@@ -109,7 +109,7 @@ class Detector(Protocol):
     def max_batch(self) -> int:
         """Windows that it can judge at once."""
 
-    def judge_windows(self, windows: Sequence[Window]) -> Verdicts:
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
         """Scores, and whether each asks for help at the detector's own threshold; never where it has none."""
 
 
@@ -133,7 +133,7 @@ class MonitorDetector:
         """The monitor's."""
         return self.monitor.max_batch
 
-    def judge_windows(self, windows: Sequence[Window]) -> Verdicts:
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
         """The monitor's own answers."""
         import torch
 
@@ -147,7 +147,7 @@ def as_detector(judge: Detector | Monitor) -> Detector:
     return judge if isinstance(judge, Detector) else MonitorDetector(judge)
 
 
-class Watch:
+class TrialWatch:
     """What one trial has shown to one detector.
 
     Args:
@@ -159,23 +159,23 @@ class Watch:
         self._glimpses: deque[Glimpse] = deque(maxlen=past + 1)
         self._step, self._seed, self._instruction = -1, seed or 0, ""
 
-    def show(self, glimpse: Glimpse, instruction: str) -> Window:
+    def show(self, glimpse: Glimpse, instruction: str) -> DetectorWindow:
         """The window that ends with this step."""
         self._glimpses.append(glimpse)
         self._step += 1
         self._instruction = instruction
         return self._window()
 
-    def amend(self, chunks: torch.Tensor | None, features: torch.Tensor | None) -> Window:
+    def amend(self, chunks: torch.Tensor | None, features: torch.Tensor | None) -> DetectorWindow:
         """The same window, its last step with what the policy would do and computes there."""
         self._glimpses[-1] = Glimpse(self._glimpses[-1].observation, chunks, features)
         return self._window()
 
-    def _window(self) -> Window:
-        return Window(tuple(self._glimpses), self._instruction, self._step, self._seed)
+    def _window(self) -> DetectorWindow:
+        return DetectorWindow(tuple(self._glimpses), self._instruction, self._step, self._seed)
 
 
-def batch_of(windows: Sequence[Window], needs: DetectorNeeds) -> dict[str, Any]:
+def batch_of(windows: Sequence[DetectorWindow], needs: DetectorNeeds) -> dict[str, Any]:
     """Windows as a batch of LeRobot's reward models.
 
     Returns:

@@ -25,7 +25,7 @@ from lerobot_roborecover.interventions.detectors.interface import (
     SEEN,
     TASK,
     DetectorNeeds,
-    Window,
+    DetectorWindow,
     batch_of,
 )
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
@@ -87,7 +87,7 @@ class ProgressDetector:
         return self.options.max_batch
 
     @torch.no_grad()
-    def judge_windows(self, windows: Sequence[Window]) -> Verdicts:
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
         """Scores, and which of them are above the threshold."""
         batch = batch_of(windows, self._needs)
         scores = -self._rewards(batch, 0)

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from lerobot_roborecover.interventions.detectors.interface import Detector, Glimpse, Watch, Window
+from lerobot_roborecover.interventions.detectors.interface import (
+    Detector,
+    DetectorWindow,
+    Glimpse,
+    TrialWatch,
+)
 from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
 from lerobot_roborecover.interventions.monitor_interface import Verdicts
 
@@ -34,13 +39,13 @@ class Watcher:
         """Trials judged at once."""
         return max(self.detector.max_batch, 1)
 
-    def start(self, seed: int | None) -> Watch:
+    def start(self, seed: int | None) -> TrialWatch:
         """A trial of that seed, of which nothing has been seen."""
-        return Watch(self._past, seed)
+        return TrialWatch(self._past, seed)
 
     def judge(
         self,
-        watches: Sequence[Watch],
+        watches: Sequence[TrialWatch],
         observations: Sequence[Mapping[str, torch.Tensor]],
         instructions: Sequence[str],
     ) -> Verdicts:
@@ -51,7 +56,7 @@ class Watcher:
             observations: of this step, LeRobot keys without a batch axis.
             instructions: of their tasks.
         """
-        windows: list[Window] = []
+        windows: list[DetectorWindow] = []
         for watch, observation, text in zip(watches, observations, instructions, strict=True):
             windows.append(watch.show(Glimpse(observation), text))
         if self._probe is not None:
