@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.collect.options import CollectOptions
 
+from lerobot_roborecover.cli.workplace import add_workplace, workplace
 from lerobot_roborecover.datasets.licenses import license_argument
 
 HELP = "Roll out a policy or a scripted driver from initial states, and keep its failures as candidates."
@@ -58,7 +59,8 @@ def build_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--no-exclude", action="append", default=[], metavar="RULE", help="do not ask this exclusion rule")
     add("--exclude-only", action="append", default=[], metavar="RULE", help="ask this exclusion rule alone")
-    add("--slots", type=int, default=0, help="simulators at once (one per core)")
+    add("--slots", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
+    add_workplace(parser, policies=True)
     add("--max-batch", type=int, default=1, help="slots that a policy is asked for at once (%(default)s)")
     add("--device", help="of the policy")
     add("--rename_map", type=json.loads, default={}, help="the env's observation keys to the policy's, JSON")
@@ -171,7 +173,9 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         judging=Judging(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
         seed=args.seed,
         frames=side,
+        workplace=workplace(args),
         slots=args.slots,
+        replicas=args.replicas,
         max_batch=args.max_batch,
         horizon=args.horizon,
         film_every=args.film_every,

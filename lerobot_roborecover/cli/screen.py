@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_roborecover.cli.workplace import add_workplace, workplace
+
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.screen.dataset import ScreenRequest
 
@@ -51,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--run-seed", type=int, default=1000, help="of the trials (%(default)s)")
     add("--device", help="of the policies")
-    add("--slots", type=int, default=0, help="simulators at work at once (one per core)")
+    add("--slots", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
+    add_workplace(parser, policies=True)
     add("--max-batch", type=int, default=64, help="observations per inference, at most (%(default)s)")
     add(
         "--env", action="append", default=[], metavar="[NAME:]KEY=VALUE",
@@ -100,4 +103,6 @@ def request(args: argparse.Namespace) -> ScreenRequest:
         device=args.device,
         slots=args.slots,
         max_batch=args.max_batch,
+        workplace=workplace(args),
+        replicas=args.replicas,
     )

@@ -6,7 +6,6 @@ be replayed: for the monitor's frames, or as a demonstration. A rerun goes on wh
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +22,8 @@ from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log, trial_ke
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.trials.places import EnginePlaces, open_engine
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 if TYPE_CHECKING:
     from lerobot_roborecover.env.configs import RecoveryEnvConfig
@@ -50,6 +50,8 @@ def run_trials(
     device: str | None = None,
     slots: int = 0,
     max_batch: int = 64,
+    workplace: Workplace = HERE,
+    replicas: int = 0,
     policy_options: Sequence[str] = (),
     rename_map: Mapping[str, str] | None = None,
     on_row: Callable[[TrialRow, int, int], None] = lambda row, done, total: None,
@@ -63,8 +65,10 @@ def run_trials(
         trials: per scenario.
         seed: of the run.
         device: of the policy; None takes what its config says.
-        slots: simulators at work at once; 0 takes one per core.
+        slots: simulators at work at once; 0 takes as many as there is room for.
         max_batch: observations per inference, at most.
+        workplace: where simulators and policy are.
+        replicas: copies of the policy on a cluster, see `EnginePlaces`.
         policy_options: `--name=value` options of the policy's config.
         rename_map: the env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
         on_row: told of each finished trial, and how many are done of how many.
@@ -90,7 +94,11 @@ def run_trials(
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
-            host = load.load_host(load.HostSpec(config, env, rename_map or {}, seed, max_batch))
+            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch)
+            places = EnginePlaces(
+                workplace, slots, replicas, str(config.device), env.obs_type != "state",
+                snapshot_dir=env.snapshot_dir or None,
+            )  # fmt: skip
             run.keep = partial(_keep_actions, folder / ACTIONS_FOLDER)
             count = [len(units) - len(todo)]
 
@@ -98,8 +106,7 @@ def run_trials(
                 count[0] += 1
                 on_row(row, count[0], len(units))
 
-            workers = min(slots or os.cpu_count() or 1, len(todo))
-            LocalEngine(run, host, slots=workers, on_row=told).run(todo)
+            open_engine(run, todo, partial(load.load_host, spec), places, on_row=told).run(todo)
         rows = {r.key(): r for r in log.rows}
     finally:
         run.pool.release()

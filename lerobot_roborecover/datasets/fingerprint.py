@@ -21,6 +21,7 @@ from lerobot_roborecover.platforms.versions import installed
 from lerobot_roborecover.replay import record_handoff
 from lerobot_roborecover.scenario import Fingerprint, Pose, Scenario, ScenarioError
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 type ResetCheck = Callable[[Simulator, Scenario], dict[str, float]]
 """Measures how far the simulator, just reset, is from what a scenario's record says; raises `ScenarioError`
@@ -49,6 +50,7 @@ def fingerprint_scenarios(
     check: ResetCheck | None = None,
     workers: int = 1,
     pool: JobPool | None = None,
+    workplace: Workplace = HERE,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Replayed]:
     """Replays every scenario once.
@@ -59,7 +61,8 @@ def fingerprint_scenarios(
             failed are tried again.
         options: of the simulator, JSON values.
         check: a function of a module, run after each reset.
-        workers: processes.
+        workers: processes; see `JobPool`.
+        workplace: where they are.
         pool: processes that are there already, with their own options, in place of new ones.
         progress: called with the numbers done and in all.
 
@@ -83,7 +86,7 @@ def fingerprint_scenarios(
             found[i] = _apply(scenarios[i], done[key])
     progress(len(found), len(scenarios))
     jobs = _jobs(scenarios, open_rows)
-    used = nullcontext(pool) if pool else JobPool(platform, options, min(workers, len(jobs)))
+    used = nullcontext(pool) if pool else JobPool(platform, options, workers, workplace=workplace)
     with file, used as processes:
 
         def keep(i: int, entry: dict[str, Any]) -> None:

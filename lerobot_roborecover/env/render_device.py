@@ -178,5 +178,10 @@ def node_environment(
     return render_environment(choice, device, devices, environment)
 
 
+def node_drawing(choice: str, turn: int) -> dict[str, str | None]:
+    """`node_environment` of the machine where this is called."""
+    return node_environment(choice, turn, egl_devices())
+
+
 if __name__ == "__main__":
     print(json.dumps([asdict(d) for d in query_devices()]))

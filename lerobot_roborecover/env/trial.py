@@ -44,8 +44,13 @@ from lerobot_roborecover.workers.messages import (
 )
 
 SOLVED_THERE = "the task's predicate already holds where the rollback went"
-FAILURES = {"raised": Outcome.SIM_ERROR, "died": Outcome.SIM_ERROR, "hung": Outcome.TIMEOUT}
-"""What a slot's failure makes of its trial, by kind; one that is `lost` is the engine's affair."""
+FAILURES = {
+    "raised": Outcome.SIM_ERROR,
+    "died": Outcome.SIM_ERROR,
+    "hung": Outcome.TIMEOUT,
+    "lost": Outcome.SIM_ERROR,
+}
+"""What a slot's failure makes of its trial, by kind; one that is `lost` is tried elsewhere first."""
 
 
 class TrialState(StrEnum):

@@ -26,10 +26,10 @@ from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackResult, SlotFailure
+from lerobot_roborecover.workers.slots import MOST_LOSSES
 
 PARK_AFTER = 3
-"""Simulator failures of one scenario in a row after which its other trials are not tried; also how often a
-trial may be lost with the machine it ran on."""
+"""Simulator failures of one scenario in a row after which its other trials are not tried."""
 PATIENCE = 0.5
 """How long a waiting slot waits for company, in inferences. Where an inference takes as long for many as for
 few, a batch that begins before its company has come costs the company a whole inference."""
@@ -272,7 +272,7 @@ class Engine:
     def _lost(self, sitting: Sitting, reason: str) -> None:
         """The trial's machine is gone: it is run again from its start, elsewhere."""
         if self._lost_again(sitting):
-            sitting.trial.fail(Outcome.SIM_ERROR, f"lost {PARK_AFTER} times, last: {reason}")
+            sitting.trial.fail(Outcome.SIM_ERROR, f"lost {MOST_LOSSES} times, last: {reason}")
             self._finish(sitting)
             return
         self._run_again(sitting)
@@ -291,7 +291,7 @@ class Engine:
         """Counts a loss; whether it was one too many."""
         key = (sitting.unit.scenario.id, sitting.unit.trial)
         self._losses[key] = self._losses.get(key, 0) + 1
-        return self._losses[key] >= PARK_AFTER
+        return self._losses[key] >= MOST_LOSSES
 
     def _run_again(self, sitting: Sitting) -> None:
         self.reruns += 1

@@ -13,6 +13,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.identity import weights_identity
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.processors import env_processors
-from lerobot_roborecover.env.render_device import egl_devices, render_environment
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.platforms import platform_named
@@ -37,9 +37,8 @@ from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.load import HostSpec, load_host, load_processors, policy_config
-from lerobot_roborecover.trials.local import open_local_engine
+from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
-from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
 
 
 def evaluate(
@@ -114,13 +113,11 @@ def evaluate(
                     line.show(tally)
 
             if tally.done < tally.total:
-                drawing = None
-                if options.obs_type != "state":
-                    drawing = render_environment("auto", str(config.device), egl_devices())
-                count = slots or default_slots(str(config.device), usable_cores(), available_gb())
-                open_local_engine(
-                    run, units, lambda: _host(spec, module, processors), count, drawing, on_row=show
-                ).run(units)
+                places = EnginePlaces(
+                    slots=slots, device=str(config.device), draws=options.obs_type != "state"
+                )
+                make_host = partial(_host, spec, module, processors)
+                open_engine(run, units, make_host, places, on_row=show).run(units)
             if line is not None:
                 line.show(tally, final=True)
             found = {(r.scenario_id, r.trial): r for r in run.rows()}

@@ -23,23 +23,21 @@ from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.render_device import egl_devices, render_environment
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import TrialRow, check_retry
-from lerobot_roborecover.trials.engine import Engine, units_of
+from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
-from lerobot_roborecover.trials.local import open_local_engine
+from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
 from lerobot_roborecover.trials.sequential import ALONE, open_watch
-from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
-from lerobot_roborecover.trials.units import OrderedQueue, Unit, UnitQueue
+from lerobot_roborecover.trials.units import OrderedQueue, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
 from lerobot_roborecover.words import counted
+from lerobot_roborecover.workers.workplace import Workplace
 
 logger = logging.getLogger(__name__)
 
-ENGINES = ("local", "ray")
 ALIASES = {
     "engine": "runner.engine",
     "videos": "runner.videos",
@@ -92,14 +90,18 @@ class RunnerOptions:
         """Outcomes of `retry`."""
         return [outcome.strip() for outcome in self.retry.split(",") if outcome.strip()]
 
+    @property
+    def workplace(self) -> Workplace:
+        """Where the run is."""
+        return Workplace(self.engine, self.ray_address, "--runner.", device="--policy.device")
+
     def check(self) -> None:
         """Refuses what cannot be used.
 
         Raises:
             OptionError: naming the option, its value and what it may be.
         """
-        if self.engine not in ENGINES:
-            raise OptionError(f"--runner.engine={self.engine}: not one of {list(ENGINES)}")
+        self.workplace.check()
         check_retry(self.retried)
         for name, low, high in (
             ("slots", 0, 4096),
@@ -229,8 +231,8 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
                 "batch_delay_s": cfg.runner.batch_delay_ms / 1e3, "on_row": show, "videos": videos,
                 "queue_of": UnitQueue if watch is None else OrderedQueue,
             }  # fmt: skip
-            make = _ray_engine if cfg.runner.engine == "ray" else _local_engine
-            engine = make(cfg, run, units, options)
+            make_host = partial(load_host, host_spec(cfg))
+            engine = open_engine(run, units, make_host, _places(cfg), **options)
             engine.run(units, stopper)
             unrun = engine.unrun
         line.show(tally, final=True)
@@ -271,29 +273,17 @@ def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
     )
 
 
-def _local_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
-    drawing, device = None, str(cfg.given_policy.device)
-    if cfg.recovery_env.obs_type != "state" or cfg.runner.videos:
-        drawing = render_environment(cfg.runner.render_device, device, egl_devices())
-    slots = cfg.runner.slots or default_slots(device, usable_cores(), available_gb())
-    return open_local_engine(run, units, lambda: load_host(host_spec(cfg)), slots, drawing, **options)
-
-
-def _ray_engine(cfg: RecoveryEvalConfig, run: Run, units: list[Unit], options: dict[str, Any]) -> Engine:
-    from lerobot_roborecover.trials.ray_engine import open_ray_engine
-
-    env = cfg.recovery_env
-    first = UnitQueue(units).take(None) if env.obs_type != "state" or cfg.runner.videos else None
-    cluster = {
-        "address": cfg.runner.ray_address,
-        "slots": cfg.runner.slots,
-        "replicas": cfg.runner.replicas,
-        "gpus": 1.0 if str(cfg.given_policy.device).startswith("cuda") else 0.0,
-        "snapshot_dir": env.snapshot_dir or None,
-        "smoke": None if first is None else first.scenario,
-        "render_device": cfg.runner.render_device,
-    }
-    return open_ray_engine(run, partial(load_host, host_spec(cfg)), **cluster, **options)
+def _places(cfg: RecoveryEvalConfig) -> EnginePlaces:
+    env, runner = cfg.recovery_env, cfg.runner
+    return EnginePlaces(
+        runner.workplace,
+        runner.slots,
+        runner.replicas,
+        str(cfg.given_policy.device),
+        env.obs_type != "state" or bool(runner.videos),
+        runner.render_device,
+        env.snapshot_dir or None,
+    )
 
 
 def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Sequence[Path]) -> None:

@@ -20,6 +20,7 @@ def check_smoke(reply: object, where: str = "") -> None:
         place = f" on node {where}" if where else ""
         raise SimulatorError(
             f"the run was not begun, because the first simulator{place} failed: {reply.message}. "
-            "'roborecover doctor' checks simulators and OpenGL; --runner.render_device=cpu draws in "
-            "software, and policies that need no pictures run with --env.obs_type=state"
+            "'roborecover doctor' checks simulators and OpenGL; MUJOCO_GL=osmesa (of roborecover eval "
+            "--runner.render_device=cpu) draws in software, and policies that need no pictures run with "
+            "--env.obs_type=state"
         )

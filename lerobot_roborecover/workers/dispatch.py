@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from multiprocessing.connection import wait
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot_roborecover.workers.messages import More, SlotFailure
-from lerobot_roborecover.workers.slots import WorkerSlot
+from lerobot_roborecover.workers.slots import MOST_LOSSES, ProcessSlot
 
 _POLL_S = 1.0
 
@@ -16,8 +17,17 @@ type Take[Item] = Callable[[Item | None, list[Item]], Item | None]
 """The next item for a slot, given the slot's last one and those under way; None where there is none now."""
 
 
+@dataclass(eq=False)
+class _Handed[Item]:
+    """An item that a slot has, or had."""
+
+    item: Item
+    losses: int = 0
+    """How often the machine that it was done on was lost."""
+
+
 def each[Item](
-    slots: Sequence[WorkerSlot],
+    slots: Sequence[ProcessSlot],
     command: str,
     take: Take[Item],
     argument: Callable[[Item], Any],
@@ -26,46 +36,78 @@ def each[Item](
 ) -> Iterator[tuple[Item, Any]]:
     """Replies as they come, with what they are of; a `SlotFailure` where the simulator failed.
 
-    Whoever stops asking ends what is under way.
+    An item whose machine is lost is done again elsewhere, `MOST_LOSSES` times in all. Whoever stops asking
+    ends what is under way.
 
     Args:
-        slots: idle ones.
+        slots: idle ones, all of one kind.
         command: to send.
         take: hands out the items.
         argument: what to send of one.
         fresh: a new process for each item.
     """
     last: dict[int, Item | None] = dict.fromkeys(range(len(slots)))
-    busy: dict[int, Item] = {}
+    busy: dict[int, _Handed[Item]] = {}
+    waiting: deque[_Handed[Item]] = deque()
+
+    def next_for(k: int) -> _Handed[Item] | None:
+        if waiting:
+            return waiting.popleft()
+        item = take(last[k], [handed.item for handed in busy.values()])
+        return None if item is None else _Handed(item)
+
     try:
         while True:
-            for k, slot in enumerate(slots):
-                if k not in busy and (item := take(last[k], list(busy.values()))) is not None:
-                    slot.send(command, argument(item))
-                    busy[k] = last[k] = item
-            if not busy:
+            idle = [k for k in range(len(slots)) if k not in busy]
+            for k in idle:
+                if not slots[k].opening and (handed := next_for(k)) is not None:
+                    slots[k].send(command, argument(handed.item))
+                    busy[k], last[k] = handed, handed.item
+            # Only an item at hand says that slots which are opening are still needed.
+            if idle and all(slots[k].opening for k in idle) and (handed := next_for(idle[0])) is not None:
+                waiting.appendleft(handed)
+            opening = [k for k in idle if slots[k].opening and waiting]
+            if not busy and not opening:
                 return
-            waited = [slots[k].ready for k in busy if slots[k].ready is not True]
-            soon = min(slots[k].deadline for k in busy) - time.monotonic()
-            waits = len(waited) == len(busy)
-            ready = set(map(id, wait(waited, max(min(_POLL_S, soon), 0.0)))) if waits else set()
-            for k in list(busy):
+            for k in _ready(slots, [*busy, *opening]):
                 slot = slots[k]
-                if slot.ready is True or id(slot.ready) in ready or time.monotonic() > slot.deadline:
-                    reply = slot.receive()
-                    if isinstance(reply, More):
-                        slot.send(command, None)
+                if k not in busy:
+                    slot.opened()
+                    continue
+                reply = slot.receive()
+                if isinstance(reply, More):
+                    slot.send(command, None)
+                    continue
+                handed = busy.pop(k)
+                if isinstance(reply, SlotFailure) and reply.kind == "lost":
+                    handed.losses += 1
+                    if handed.losses < MOST_LOSSES:
+                        waiting.append(handed)
                         continue
-                    if fresh:
-                        slot.end()
-                    yield busy.pop(k), reply
+                    reply = replace(reply, message=f"lost {MOST_LOSSES} times, last: {reply.message}")
+                if fresh:
+                    slot.end()
+                yield handed.item, reply
     finally:
         for k in busy:
             slots[k].end()
 
 
+def _ready(slots: Sequence[ProcessSlot], parties: Sequence[int]) -> list[int]:
+    """Which of the slots have something to say, once any has."""
+    waited = [slots[k].ready for k in parties if slots[k].ready is not True]
+    soon = min(slots[k].deadline for k in parties) - time.monotonic()
+    waits = len(waited) == len(parties)
+    ready = set(map(id, slots[0].wait(waited, max(min(_POLL_S, soon), 0.0)))) if waits else set()
+    return [
+        k
+        for k in parties
+        if slots[k].ready is True or id(slots[k].ready) in ready or time.monotonic() > slots[k].deadline
+    ]
+
+
 def in_order[Item](
-    slots: Sequence[WorkerSlot], command: str, items: Sequence[Item], argument: Callable[[Item], Any]
+    slots: Sequence[ProcessSlot], command: str, items: Sequence[Item], argument: Callable[[Item], Any]
 ) -> Iterator[Any]:
     """Replies in the order of the items, with few of them ahead of the caller: they are large.
 

@@ -14,7 +14,7 @@ import pickle
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from types import TracebackType
 from typing import Any
@@ -24,7 +24,8 @@ from lerobot_roborecover.platforms import SimulatorError, make_simulator
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.workers.dispatch import each, in_order
 from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
-from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
+from lerobot_roborecover.workers.slots import ProcessSlot, SlotPool
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 SERVER = f"{__name__}:JobServer"
 
@@ -121,9 +122,10 @@ class JobPool:
     Args:
         platform: of the simulators; empty where no job asks for one.
         options: of the simulators, JSON values.
-        workers: processes.
+        workers: processes; 0 takes one, on a cluster as many as it has CPUs.
         limit_s: longest that one job may take; None waits for ever.
         fresh: each job has a process of its own; its start counts.
+        workplace: where they live. A cluster is joined for the first job.
     """
 
     def __init__(
@@ -134,9 +136,11 @@ class JobPool:
         *,
         limit_s: float | None = None,
         fresh: bool = False,
+        workplace: Workplace = HERE,
     ):
         self.platform, self.options = platform, dict(options or {})
-        self._workers, self._fresh = max(1, workers), fresh
+        self._asked, self._fresh, self._workplace = workers, fresh, replace(workplace, count="workers")
+        self._settled = 0
         self._pool = SlotPool(
             SlotConfig(platform, self.options, server=SERVER, start_s=0.0 if fresh else None),
             workers=True,
@@ -163,7 +167,8 @@ class JobPool:
         """
         name = _name_of(work)
         drawn = iter(items)
-        first = list(islice(drawn, self._workers))
+        first = list(islice(drawn, 1))
+        first += islice(drawn, self._most() - 1 if first else 0)
         waiting = chain(first, drawn)
 
         def take(_last: list[I] | None, _busy: list[list[I]]) -> list[I] | None:
@@ -196,7 +201,7 @@ class JobPool:
         arguments: Callable[[I], tuple] = lambda item: (item,),
     ) -> Iterator[Any]:
         """The results in the order of the items, with few of them ahead of the caller: see `run`."""
-        name, slots = _name_of(work), self._slots(min(self._workers, len(items)))
+        name, slots = _name_of(work), self._slots(min(self._most(), len(items)) if items else 0)
         for outcome in in_order(slots, "run", items, lambda item: Job(name, arguments(item))):
             yield _value(outcome)
 
@@ -205,7 +210,12 @@ class JobPool:
         ((_, value),) = self.run(work, [arguments], lambda them: them)
         return value
 
-    def _slots(self, count: int) -> list[WorkerSlot]:
+    def _most(self) -> int:
+        """How many processes there may be."""
+        self._settled = self._settled or self._workplace.settle(self._pool, self._asked, 1)
+        return self._settled
+
+    def _slots(self, count: int) -> list[ProcessSlot]:
         return self._pool.worker_slots(count)
 
 

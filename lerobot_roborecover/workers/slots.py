@@ -15,14 +15,16 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
-from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from multiprocessing.connection import Connection, wait
+from typing import Any, Protocol, cast
 
 from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.transport import Channel, make_memory
 
+MOST_LOSSES = 3
+"""How often one thing may be lost with the machine that it was done on, before it is taken for the cause."""
 _LOG_TAIL_BYTES = 600
 _START_S = 60.0
 """What a fresh worker may take to import its simulator, on top of the watchdog's limit for its first
@@ -41,6 +43,35 @@ class Slot(Protocol):
 
     def close(self) -> None:
         """Ends the slot."""
+
+
+class ProcessSlot(Slot, Protocol):
+    """A slot in a process of its own, so that its caller need not wait: here, or on a cluster."""
+
+    @property
+    def opening(self) -> bool:
+        """Whether it cannot be asked yet; `ready` then says when to call `opened`."""
+
+    @property
+    def ready(self) -> Any:
+        """What `wait` waits on for the reply; True where it is there already."""
+
+    @property
+    def deadline(self) -> float:
+        """When the command under way counts as hung, on the monotonic clock."""
+
+    def opened(self) -> None:
+        """Finds out whether the opening has worked; it may have begun again."""
+
+    def wait(self, handles: list[Any], timeout_s: float) -> Collection[Any]:
+        """Those of the handles, of slots of this kind, that are ready, once any is or the time is up."""
+
+    def end(self) -> None:
+        """Ends the process at once, whatever it does; the next command starts another."""
+
+
+type MakeSlot = Callable[[SlotConfig, float, int], Slot]
+"""Makes a slot, given what it serves, its watchdog and its number in its pool."""
 
 
 class InlineSlot:
@@ -85,6 +116,7 @@ class WorkerSlot:
 
     opening = False
     """A command can be sent at once: it waits in the socket until the worker has started."""
+    wait = staticmethod(wait)
 
     def __init__(self, config: SlotConfig, timeout_s: float):
         self._config = config
@@ -238,11 +270,14 @@ class SlotPool:
     """
 
     def __init__(self, config: SlotConfig, *, workers: bool, timeout_s: float):
-        self._config, self._workers, self._timeout_s = config, workers, timeout_s
+        self._config, self._timeout_s = config, timeout_s
         self._slots: list[Slot] = []
         self._users = 0
         self._spaces: dict | None = None
         self._closers: list[Callable[[], object]] = []
+        self._make: MakeSlot = lambda config, timeout_s, turn: (
+            WorkerSlot(config, timeout_s) if workers else InlineSlot(config)
+        )
 
     @property
     def config(self) -> SlotConfig:
@@ -258,8 +293,12 @@ class SlotPool:
         """Changes the configuration of slots that have not started yet."""
         self._config = replace(self._config, **changes)
 
+    def make_with(self, make: MakeSlot) -> None:
+        """Has slots that have not started yet made elsewhere."""
+        self._make = make
+
     def on_close(self, closer: Callable[[], object]) -> None:
-        """Has `closer` called once the last user is out."""
+        """Has `closer` called once the last user is out, before those that were there already."""
         self._closers.append(closer)
 
     def acquire(self) -> None:
@@ -275,13 +314,22 @@ class SlotPool:
     def slots(self, count: int) -> list[Slot]:
         """The first `count` slots."""
         while len(self._slots) < count:
-            config = self._config
-            self._slots.append(WorkerSlot(config, self._timeout_s) if self._workers else InlineSlot(config))
+            self._slots.append(self._make(self._config, self._timeout_s, len(self._slots)))
         return self._slots[:count]
 
-    def worker_slots(self, count: int) -> list[WorkerSlot]:
+    def worker_slots(self, count: int) -> list[ProcessSlot]:
         """The first `count` slots, of a pool whose slots are processes of their own."""
-        return [slot for slot in self.slots(count) if isinstance(slot, WorkerSlot)]
+        return [cast(ProcessSlot, slot) for slot in self.slots(count) if not isinstance(slot, InlineSlot)]
+
+    def ask(self, command: str) -> Reply:
+        """The first slot's reply to a command that has no argument."""
+        slot = self.slots(1)[0]
+        for _ in range(MOST_LOSSES):
+            slot.send(command)
+            reply = slot.receive()
+            if not (isinstance(reply, SlotFailure) and reply.kind == "lost"):
+                break
+        return reply
 
     def spaces(self) -> dict:
         """`observation_space` and `hz` of the simulator.
@@ -290,9 +338,7 @@ class SlotPool:
             RuntimeError: the simulator cannot be made.
         """
         if self._spaces is None:
-            slot = self.slots(1)[0]
-            slot.send("spaces")
-            reply = slot.receive()
+            reply = self.ask("spaces")
             if not isinstance(reply, dict):
                 why = reply.message if isinstance(reply, SlotFailure) else repr(reply)
                 raise RuntimeError(f"no simulator could be made: {why}")
@@ -304,6 +350,5 @@ class SlotPool:
         for slot in self._slots:
             slot.close()
         self._slots = []
-        closers, self._closers = self._closers, []
-        for closer in closers:
-            closer()
+        while self._closers:
+            self._closers.pop()()

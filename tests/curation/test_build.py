@@ -16,9 +16,9 @@ from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.curation.attrition import Decision, StageCounts, record_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.collection import Collected
-from lerobot_roborecover.curation.pipeline.config import read_config
+from lerobot_roborecover.curation.pipeline.config import CollectPart, ScreenPart, ValidatePart, read_config
 from lerobot_roborecover.curation.pipeline.requests import collect_options
-from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting, _key
+from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting, _key, _options
 from lerobot_roborecover.curation.pipeline.summary import markdown
 from lerobot_roborecover.curation.pipeline.work import Work
 from lerobot_roborecover.curation.split import SplitConfig
@@ -163,6 +163,11 @@ def stand_in(tmp_path, monkeypatch):
     return build
 
 
+@pytest.mark.parametrize("part", [CollectPart, ScreenPart, ValidatePart])
+def test_a_place_is_no_part_of_what_a_stage_makes(part):
+    assert _options(part(engine="ray", ray_address="head:6379")) == _options(part())
+
+
 def test_what_runs_again(stand_in):
     build = stand_in
     with pytest.raises(Waiting, match=r"3 candidates wait for votes \(3 each\)"):
@@ -187,6 +192,8 @@ def test_what_runs_again(stand_in):
     assert build(content=seed) == ["split", "render"]
     assert build.asked["split"][1].seed == 7
     assert build(content=changed(seed, "screen.slots", 9)) == [], "a pace is no change"
+    for key, value in (("screen.engine", "local"), ("validate.ray_address", "head:6379")):
+        assert build(content=changed(seed, key, value)) == [], "nor is a place"
     assert build(content=changed(seed, "screen.keep", [2, 18])) == ["screen", "validate", "split", "render"]
     assert build.asked["screen"][0].rule.keep == ("2", "18")
     assert build(content=changed(seed, "screen.keep", [0.1, 0.9])) == [

@@ -30,7 +30,8 @@ MOST = {
             "expert": "expert_biased", "name": "me", "task": ["push-*", "a b"], "seeds": "0-4", "seed": 11,
             "reset_seed": 12, "trials": 2, "horizon": 99, "perturb": True, "perturb_steps": 5,
             "scene_touched": 2.5, "frames": 32, "film_every": 2, "no_exclude": ["a"],
-            "exclude_only": ["b", "c"], "slots": 3, "max_batch": 2, "device": "cpu", "watchdog": 33,
+            "exclude_only": ["b", "c"], "engine": "ray", "ray_address": "head:6379", "replicas": 2,
+            "slots": 3, "max_batch": 2, "device": "cpu", "watchdog": 33,
             "retry_errors": True, "env": {"obs_type": "state", "flag": True, "list": [1, 2]},
             "rename_map": {"a": "b"},
         },
@@ -43,11 +44,12 @@ MOST = {
             {"path": "lab/other"},
         ],
         "trials": 3, "keep": [2, 4], "max_invalid": 2, "run_seed": 5, "device": "cuda", "slots": 7,
-        "max_batch": 3, "env": {"watchdog_s": 1.5},
+        "engine": "ray", "ray_address": "head:6379", "replicas": 2, "max_batch": 3,
+        "env": {"watchdog_s": 1.5},
     },
     "validate": {
         "runs": 2, "seed": 3, "tolerance_mm": 1.5, "min_ssim": 0.5, "no_frames": True, "no_outcomes": True,
-        "workers": 3, "limit_s": 10, "env": {"a": "b"},
+        "engine": "ray", "ray_address": "head:6379", "workers": 3, "limit_s": 10, "env": {"a": "b"},
     },
     "split": {"sizes": {"train": 10, "test": 5}, "seed": 4, "apart": "trajectory,record"},
     "render": {"frames": 128, "workers": 3, "env": {"q": "fast"}},
@@ -71,6 +73,7 @@ COMMANDS = {
         "collect": "--env.type=roborecover_fake --expert expert_biased --name me --task push-* --task a%b "
         "--seeds 0-4 --seed 11 --reset-seed 12 --trials 2 --horizon 99 --perturb --perturb-steps 5 "
         "--scene-touched 2.5 --frames 32 --film-every 2 --no-exclude a --exclude-only b --exclude-only c "
+        "--engine ray --ray-address head:6379 --replicas 2 "
         "--slots 3 --max-batch 2 --device cpu --watchdog 33 --retry-errors --env.flag=true "
         '--env.list=[1,%2] --env.obs_type=state --rename_map {"a":"b"} --license mit --out out/collect/one',
         "agree": "out/candidates --votes votes --votes-needed 2 --tolerance 4 --no-consensus drop "
@@ -78,9 +81,10 @@ COMMANDS = {
         "screen": "out/scenarios --policy act=lab/act --policy lab/other --deterministic act "
         "--policy-option act:k=1 --policy-option act:l=[1] --env act:obs_type=state --env watchdog_s=1.5 "
         '--rename-map act:{"c":"d"} --trials 3 --keep 2 4 --max-invalid 2 --run-seed 5 --device cuda '
-        "--slots 7 --max-batch 3 --out out/screened",
+        "--engine ray --ray-address head:6379 --replicas 2 --slots 7 --max-batch 3 --out out/screened",
         "validate": "out/screened --trials-folder out/screened.trials --candidates out/candidates --runs 2 "
-        "--seed 3 --tolerance-mm 1.5 --min-ssim 0.5 --no-frames --no-outcomes --workers 3 --limit-s 10 "
+        "--seed 3 --tolerance-mm 1.5 --min-ssim 0.5 --no-frames --no-outcomes --engine ray "
+        "--ray-address head:6379 --workers 3 --limit-s 10 "
         "--env a=b --out out/validated",
         "split": "out/validated --split train=10 --split test=5 --seed 4 --apart trajectory,record "
         "--out out/split",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -14,9 +13,12 @@ from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, open_run
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.trials.engine import units_of
+from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.workers.messages import SlotConfig
+from lerobot_roborecover.workers.workplace import Workplace
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.loop import evaluate, outcomes
+from tests.support.ray_cluster import two_nodes
 from tests.trials.test_local_engine import PushHost
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.nightly]
@@ -26,24 +28,8 @@ TRIALS = 4
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A head with two CPUs and a second node with two, which the last test takes away."""
-    import ray
-    from ray.cluster_utils import Cluster
-
-    small = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        # Actors import the tests' own policy.
-        patch.setenv("PYTHONPATH", ":".join([str(Path(__file__).parents[2]), *(p for p in sys.path if p)]))
-        cluster = Cluster(initialize_head=True, head_node_args=small)
-        try:
-            ray.init(address=cluster.address, log_to_driver=False)
-            cluster.second = cluster.add_node(**small)
-            cluster.wait_for_nodes()
-            yield cluster
-        finally:
-            ray.shutdown()
-            cluster.shutdown()
+    with two_nodes() as nodes:
+        yield nodes
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +48,9 @@ def no_policy():
 
 def run_on(
     dataset, log, *, step_s=0.0, obs_type="state", slots=0, on_row=lambda engine: None, make_host=PushHost,
-    engine_options=None, **options,
+    places=None, **options,
 ):  # fmt: skip
     """Rows, and how many trials were begun again; `on_row` gets the engine."""
-    from lerobot_roborecover.trials.ray_engine import open_ray_engine
-
     scenarios, run = open_run(
         RecoveryOptions(scenarios=str(dataset), trial_log=str(log), **options),
         PlatformPart(SlotConfig("fake", {"step_s": step_s, "obs_type": obs_type}), {}, None),
@@ -76,11 +60,10 @@ def run_on(
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        engine = open_ray_engine(
-            run, make_host, address="auto", slots=slots, replicas=1, gpus=0.0,
-            on_row=lambda row: on_row(engine), **(engine_options or {}),
-        )  # fmt: skip
-        engine.run(units_of(list(scenarios), TRIALS))
+        units = units_of(list(scenarios), TRIALS)
+        there = EnginePlaces(Workplace("ray", prefix="--runner."), slots, **(places or {}))
+        engine = open_engine(run, units, make_host, there, on_row=lambda row: on_row(engine))
+        engine.run(units)
     finally:
         run.pool.release()
     return read_trial_log(log), engine.reruns
@@ -114,12 +97,10 @@ def test_a_policy_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
 
 def test_a_simulator_that_cannot_draw_ends_the_run_before_its_first_trial(cluster, dataset, tmp_path):
     """Every simulator makes a picture on its own node first."""
-    from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.platforms import SimulatorError
 
-    smoke = load_scenarios(str(dataset))[0]
     with pytest.raises(SimulatorError, match=r"first simulator on node [0-9.]+ failed: .*render_device=99"):
-        run_on(dataset, tmp_path / "a.jsonl", engine_options={"smoke": smoke, "render_device": "99"})
+        run_on(dataset, tmp_path / "a.jsonl", places={"draws": True, "render_device": "99"})
     with pytest.raises(SimulatorError, match=r"first simulator on node [0-9.]+ failed: .*'smell'"):
         run_on(dataset, tmp_path / "b.jsonl", obs_type="smell")
     assert read_trial_log(tmp_path / "a.jsonl") == read_trial_log(tmp_path / "b.jsonl") == []
@@ -159,7 +140,7 @@ def test_a_node_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
     def kill_in_the_middle(engine):
         done["rows"] += 1
         if done["rows"] == 5:
-            cluster.remove_node(cluster.second, allow_graceful=False)
+            cluster.lose_a_node()
 
     rows, reruns = run_on(dataset, log, step_s=0.005, on_row=kill_in_the_middle)
     assert done["rows"] == len(rows) == len(reference)

@@ -13,6 +13,7 @@ from lerobot_roborecover.curation.collect.starts import Starts
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 
 def parse_side(text: str) -> int:
@@ -62,8 +63,12 @@ class CollectOptions:
     """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
     """Side of the pictures in pixels; 0 films none."""
+    workplace: Workplace = HERE
+    """Where rollouts are, and replays for the pictures."""
     slots: int = 0
-    """Simulators at once; 0 takes one a core."""
+    """Simulators at once; 0 takes one a core, or all CPUs of a cluster that policies leave over."""
+    replicas: int = 0
+    """Copies of the policy on a cluster; 0 takes one per GPU, or one on the CPU."""
     max_batch: int = 1
     """Slots that a policy is asked for at once. With 1 the result does not depend on their number."""
     part_size: int = 20
@@ -84,10 +89,12 @@ class CollectOptions:
                 "who drives? Give either --policy.path=CHECKPOINT or --expert NAME"
                 + (", not both" if self.policy else "")
             )
+        self.workplace.check()
         if self.expert:
             check_expert(self.platform, self.expert)
         for name, low, high in (
-            ("perturbed_steps", 1, 100_000), ("seed", 0, 2**32 - 1), ("slots", 0, 1024),
+            ("perturbed_steps", 1, 100_000), ("seed", 0, 2**32 - 1), ("slots", 0, 4096),
+            ("replicas", 0, 4096),
             ("horizon", 0, 10_000), ("max_batch", 1, 4096), ("part_size", 1, 10_000),
             ("watchdog_s", 1, 86_400),
         ):  # fmt: skip

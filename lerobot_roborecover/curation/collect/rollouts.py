@@ -129,28 +129,36 @@ def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnE
 
 
 def run_policy(
-    units: Sequence[Planned], pool: SlotPool, slots: int, host: Any, seed: int, on_end: OnEnd
+    passes: Sequence[Sequence[Planned]],
+    pool: SlotPool,
+    make_host: Callable[[], Any],
+    places: Any,
+    seed: int,
+    on_end: OnEnd,
 ) -> None:
     """Lets a policy drive, through the engine.
 
     Args:
-        units: what to drive.
+        passes: what to drive, one after the other; two in a pass have different ids.
         pool: of slots with `collect_server.SERVER`.
-        slots: how many.
-        host: the policy.
+        make_host: loads the policy.
+        places: where, `trials.places.EnginePlaces`.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
         on_end: told of each.
     """
-    from lerobot_roborecover.trials.local import LocalEngine
+    from lerobot_roborecover.trials.places import open_engine
 
-    if not units:
+    units = [[Unit(u, u.trial) for u in wanted] for wanted in passes]
+    if not any(units):
         return
-    protocol = Protocol("recovery", 0, units[0].driver, seed, None)
 
     def keep(trial: Trial, row: TrialRow) -> None:
         assert isinstance(trial.scenario, Planned)
         on_end(Ended(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment)
 
+    driver = next(u.driver for wanted in passes for u in wanted)
+    protocol = Protocol("recovery", 0, driver, seed, None)
     run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
-    engine = LocalEngine(run, host, slots=min(slots, len(units)))
-    engine.run([Unit(u, u.trial) for u in units])
+    engine = open_engine(run, max(units, key=len), make_host, places)
+    for wanted in units:
+        engine.run(wanted)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.record import RecorderSettings
-from lerobot_roborecover.curation.collect.rollouts import Ended, RolloutBook, run_expert, run_policy
+from lerobot_roborecover.curation.collect.rollouts import Ended, OnEnd, RolloutBook, run_expert, run_policy
 from lerobot_roborecover.curation.collect.server import SERVER
 from lerobot_roborecover.curation.collect.starts import Planned
 from lerobot_roborecover.curation.collect.write import Writing, write_collection
@@ -22,6 +23,7 @@ from lerobot_roborecover.trials.progress import ProgressLine
 from lerobot_roborecover.trials.sizes import usable_cores
 from lerobot_roborecover.workers.dispatch import failed
 from lerobot_roborecover.workers.slots import SlotPool
+from lerobot_roborecover.workers.workplace import Opening
 
 PARTS_FOLDER = "parts"
 
@@ -42,10 +44,6 @@ class Count:
         return self.solved / self.ended if self.ended else None
 
 
-def _slot_count(options: CollectOptions) -> int:
-    return options.slots or usable_cores()
-
-
 def roll_out(
     options: CollectOptions, env: Any, spec: PlatformPart, units: Sequence[Planned], book: RolloutBook
 ) -> None:
@@ -58,46 +56,59 @@ def roll_out(
         for wanted in passes
     ]
     total, left = sum(map(len, passes)), sum(map(len, todo))
-    count, line = Count(total - left, total), ProgressLine("rollouts", detailed=True, unit="rollouts")
-    line.show(count)
+    progress, line = Count(total - left, total), ProgressLine("rollouts", detailed=True, unit="rollouts")
+    line.show(progress)
     if not left:
         return
 
     def on_end(ended: Ended, record: bytes) -> None:
         book.add(ended, record)
-        count.done += 1
-        count.ended += 1
-        count.solved += ended.outcome == "success"
-        line.show(count)
+        progress.done += 1
+        progress.ended += 1
+        progress.solved += ended.outcome == "success"
+        line.show(progress)
 
     settings = asdict(RecorderSettings(options.seed, options.expert, options.perturbed_steps))
-    slot = replace(spec.slot, server=SERVER, settings=settings, environment=_drawing(options, env))
+    slot = replace(spec.slot, server=SERVER, settings=settings)
+    draws = getattr(env, "obs_type", "state") != "state"
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
     pool.acquire()
     try:
-        host = _load_host(options, env) if options.policy else None
-        for wanted in todo:
-            if options.expert:
-                run_expert(wanted, pool, _slot_count(options), on_end)
-            else:
-                run_policy(wanted, pool, _slot_count(options), host, options.seed, on_end)
-        line.show(count, final=True)
+        if options.expert:
+            count = _settle(pool, options, draws=draws)
+            for wanted in todo:
+                run_expert(wanted, pool, count, on_end)
+        else:
+            _run_policy(options, env, todo, pool, draws, on_end)
+        line.show(progress, final=True)
     finally:
         pool.release()
 
 
-def _drawing(options: CollectOptions, env: Any, *, films: bool = False) -> Mapping[str, str | None]:
-    """Where the workers draw, if they do."""
-    if not films and getattr(env, "obs_type", "state") == "state":
-        return {}
-    from lerobot_roborecover.env.render_device import egl_devices, render_environment
+def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
+    """Has the pool's slots made where the options say, drawing on that machine's own device; how many there
+    may be."""
+    opening = Opening()
+    if draws:
+        from lerobot_roborecover.env.render_device import egl_devices, node_drawing, render_environment
 
-    return render_environment("auto", options.device or "cpu", egl_devices())
+        opening = Opening(partial(node_drawing, "auto"))
+        if not options.workplace.on_cluster:
+            pool.configure(environment=render_environment("auto", options.device or "cpu", egl_devices()))
+    return options.workplace.settle(pool, options.slots, usable_cores(), opening)
 
 
-def _load_host(options: CollectOptions, env: Any) -> Any:
+def _run_policy(
+    options: CollectOptions,
+    env: Any,
+    todo: Sequence[Sequence[Planned]],
+    pool: SlotPool,
+    draws: bool,
+    on_end: OnEnd,
+) -> None:
     from lerobot_roborecover.env.intervention_options import POLICY_TYPE
     from lerobot_roborecover.trials import load
+    from lerobot_roborecover.trials.places import EnginePlaces
 
     config = load.policy_config(options.policy, options.policy_options, options.device)
     if config.type == POLICY_TYPE:
@@ -106,7 +117,8 @@ def _load_host(options: CollectOptions, env: Any) -> Any:
             "one rollout; collect from its base policy"
         )
     spec = load.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
-    return load.load_host(spec)
+    places = EnginePlaces(options.workplace, options.slots, options.replicas, str(config.device), draws)
+    run_policy(todo, pool, partial(load.load_host, spec), places, options.seed, on_end)
 
 
 def film_and_write(
@@ -130,24 +142,22 @@ def film_and_write(
     Raises:
         ScenarioError: nothing could be filmed, or the disk is full.
     """
-    drawing = _drawing(options, None, films=True) if options.frames else {}
     slot = replace(
-        spec.slot, server=SERVER, settings={}, environment=drawing, options=_film_options(options, spec),
-        control_mode=None,
-    )  # fmt: skip
+        spec.slot, server=SERVER, settings={}, options=_film_options(options, spec), control_mode=None
+    )
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
     pool.acquire()
     try:
-        (one,) = pool.slots(1)
-        one.send("fingerprint")
-        versions = one.receive()
+        later = replace(options, workplace=replace(options.workplace, fits=True))
+        slots = _settle(pool, later, draws=bool(options.frames))
+        versions = pool.ask("fingerprint")
         if not isinstance(versions, dict):
             raise ScenarioError(f"no simulator could be made to film with: {failed(versions)}")
         writing = Writing(
             records=book.records,
             parts=book.work / PARTS_FOLDER,
             pool=pool,
-            slots=_slot_count(options),
+            slots=slots,
             fps=round(pool.spaces()["hz"]),
             versions=versions,
             frames=f"{options.frames}/{options.film_every}",

@@ -81,7 +81,9 @@ def check_build(config: ChainConfig) -> list[str]:
         rejects = config.validate.rejects
         if rejects and not Path(rejects).is_file():
             raise OptionError(f"rejects {rejects} is not there")
-        _check_env(config.platform, requests.validation_request(config, places).env)
+        validation = requests.validation_request(config, places)
+        validation.workplace.check()
+        _check_env(config.platform, validation.env)
     with problems.of("split"):
         requests.split_config(config)
     if config.render is not None:

@@ -47,6 +47,9 @@ class CollectPart:
     film_every: int | None = None
     no_exclude: list[str] = field(default_factory=list)
     exclude_only: list[str] = field(default_factory=list)
+    engine: str | None = None
+    ray_address: str | None = None
+    replicas: int | None = None
     slots: int | None = None
     max_batch: int | None = None
     device: str | None = None
@@ -94,6 +97,9 @@ class ScreenPart:
     max_invalid: int | None = None
     run_seed: int | None = None
     device: str | None = None
+    engine: str | None = None
+    ray_address: str | None = None
+    replicas: int | None = None
     slots: int | None = None
     max_batch: int | None = None
     env: dict[str, Any] = field(default_factory=dict)
@@ -110,6 +116,8 @@ class ValidatePart:
     no_frames: bool | None = None
     no_outcomes: bool | None = None
     rejects: str | None = None
+    engine: str | None = None
+    ray_address: str | None = None
     workers: int | None = None
     limit_s: float | None = None
     env: dict[str, Any] = field(default_factory=dict)

@@ -14,7 +14,14 @@ from lerobot_roborecover.curation.agree import AgreeRequest
 from lerobot_roborecover.curation.collect.judge import Judging
 from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
 from lerobot_roborecover.curation.collect.starts import parse_numbers
-from lerobot_roborecover.curation.pipeline.config import ChainConfig, CollectPart, PublishPart, RenderPart
+from lerobot_roborecover.curation.pipeline.config import (
+    ChainConfig,
+    CollectPart,
+    PublishPart,
+    RenderPart,
+    ScreenPart,
+    ValidatePart,
+)
 from lerobot_roborecover.curation.pipeline.places import Places
 from lerobot_roborecover.curation.publishing import PublishRequest
 from lerobot_roborecover.curation.render import RenderRequest
@@ -28,6 +35,7 @@ from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.datasets.publish import PublishConfig
 from lerobot_roborecover.env.identity import policy_identity
 from lerobot_roborecover.platforms.starts import Starts
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 
 def given[T](value: T | None, default: T) -> T:
@@ -44,6 +52,11 @@ def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return json.dumps(value) if isinstance(value, (list, dict)) else str(value)
+
+
+def workplace(part: CollectPart | ScreenPart | ValidatePart) -> Workplace:
+    """Where a stage's simulators are."""
+    return Workplace(given(part.engine, HERE.engine), given(part.ray_address, HERE.address))
 
 
 def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path) -> CollectOptions:
@@ -92,7 +105,9 @@ def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path
         horizon=given(part.horizon, default.horizon),
         film_every=given(part.film_every, default.film_every),
         frames=parse_side(str(given(part.frames, default.frames))),
+        workplace=workplace(part),
         slots=given(part.slots, default.slots),
+        replicas=given(part.replicas, default.replicas),
         max_batch=given(part.max_batch, default.max_batch),
         watchdog_s=given(part.watchdog, default.watchdog_s),
         retry_errors=given(part.retry_errors, default.retry_errors),
@@ -173,6 +188,8 @@ def screen_request(config: ChainConfig, places: Places, rule: ScreenRule) -> Scr
         device=part.device,
         slots=given(part.slots, ScreenRequest.slots),
         max_batch=given(part.max_batch, ScreenRequest.max_batch),
+        workplace=workplace(part),
+        replicas=given(part.replicas, ScreenRequest.replicas),
     )
 
 
@@ -199,6 +216,7 @@ def validation_request(config: ChainConfig, places: Places) -> ValidationRequest
         env=assignments(part.env),
         rejects=read_rejects(Path(part.rejects) if part.rejects else None),
         workers=given(part.workers, default.workers),
+        workplace=workplace(part),
         limit_s=given(part.limit_s, default.limit_s),
     )
 

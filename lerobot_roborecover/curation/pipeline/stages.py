@@ -41,7 +41,7 @@ from lerobot_roborecover.words import counted, lasting, next_line
 STAGES = ("collect", "join", "annotate", "agree", "screen", "validate", "split", "render", "publish")
 JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
-_PACE = ("slots", "workers", "limit_s", "watchdog", "retry_errors")
+_PACE = ("engine", "ray_address", "replicas", "slots", "workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
 
 

@@ -31,6 +31,7 @@ from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import check_new
 from lerobot_roborecover.words import counted, next_line
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 SCREENING_FILE = "screening.json"
 
@@ -61,6 +62,10 @@ class ScreenRequest:
     device: str | None = None
     slots: int = 0
     max_batch: int = 64
+    workplace: Workplace = HERE
+    """Where trials are run."""
+    replicas: int = 0
+    """Copies of a policy on a cluster; 0 takes one per GPU, or one on the CPU."""
 
     @property
     def trials(self) -> Path:
@@ -73,6 +78,7 @@ class ScreenRequest:
         Raises:
             OptionError: policies cannot be told apart, or an option is not one for screening.
         """
+        self.workplace.check()
         check_policies(self.policies)
         unknown = set(self.deterministic) - {p.name for p in self.policies}
         if unknown:
@@ -118,7 +124,7 @@ def screen_dataset(
         check_new(request.out)
     scenarios = load_scenarios(request.dataset)
     rows: dict[str, list[TrialRow]] = {}
-    for policy in request.policies:
+    for number, policy in enumerate(request.policies):
         folder = request.trials / policy.name
         for other in request.trials_from:
             if (other / policy.name).is_dir():
@@ -129,7 +135,8 @@ def screen_dataset(
         trials = run_policy(
             policy, request.dataset, scenarios.platform, request.trials, trials=count,
             run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
-            slots=request.slots, max_batch=request.max_batch,
+            slots=request.slots, max_batch=request.max_batch, replicas=request.replicas,
+            workplace=replace(request.workplace, fits=number > 0),
             on_row=lambda row, done, total, name=policy.name: progress(name, done, total),
         )  # fmt: skip
         rows[policy.name] = [t.row for t in trials]

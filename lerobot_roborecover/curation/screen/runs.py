@@ -27,6 +27,7 @@ from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.env.trial_log import TrialLog, check_retry
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_file, write_whole
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 POLICY_FILE = "policy.json"
 RETRIED_FILE = "retried.jsonl"
@@ -173,6 +174,8 @@ def run_policy(
     device: str | None = None,
     slots: int = 0,
     max_batch: int = 64,
+    workplace: Workplace = HERE,
+    replicas: int = 0,
     on_row: Callable[[Any, int, int], None] = lambda row, done, total: None,
 ) -> list[PolicyTrial]:
     """Runs what the policy's folder does not hold yet, and returns everything.
@@ -187,8 +190,7 @@ def run_policy(
         env: `name=value` options of the env type.
         shard: `k/n`, or empty for everything.
         device: of the policy.
-        slots: simulators at work at once; 0 takes one per core.
-        max_batch: observations per inference, at most.
+        slots, max_batch, workplace, replicas: of `run_trials`.
         on_row: told of each finished trial, and how many are done of how many.
 
     Raises:
@@ -200,7 +202,8 @@ def run_policy(
     config = env_config(platform, scenarios, [f"--{option}" for option in given])
     return run_trials(
         policy.path, config, mine, trials=trials, seed=run_seed, device=device, slots=slots,
-        max_batch=max_batch, policy_options=[f"--{o}" for o in policy.options],
+        max_batch=max_batch, workplace=workplace, replicas=replicas,
+        policy_options=[f"--{o}" for o in policy.options],
         rename_map=policy.rename_map, on_row=on_row,
     )  # fmt: skip
 

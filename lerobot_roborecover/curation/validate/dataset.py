@@ -75,6 +75,7 @@ def validate_dataset(
         ScenarioError: the request makes no sense, originals are missing, or no scenario passes.
         OptionError: an option of the env type cannot be used.
     """
+    request.workplace.check()
     check_replaceable(request.out)
     if request.rule.frames and importlib.util.find_spec("skimage") is None:
         raise OptionError(
@@ -157,14 +158,19 @@ def replay_all(
                 todo.append(job)
         progress(len(found), len(scenarios))
         ready = (replace(job, originals=originals.of(job.scenario)) for job in todo)
+        platform = scenarios[0].platform if len(scenarios) else ""
         # A process of its own for each, so that one which crashes or hangs is only its own end.
-        with JobPool(workers=request.workers, limit_s=request.limit_s, fresh=True) as pool:
+        with JobPool(
+            platform, workers=request.workers, limit_s=request.limit_s, fresh=True,
+            workplace=request.workplace,
+        ) as pool:  # fmt: skip
             for job, outcome in pool.outcomes(replay_job, ready, lambda job: (job,)):
                 report = _report_of(job, outcome)
                 result = report.replays
                 if report.sheet:
                     write_whole(request.sheet(job.scenario.id), report.sheet)
-                journal.append({"key": job.key, "id": job.scenario.id, "replays": asdict(result)})
+                if not (isinstance(outcome, SlotFailure) and outcome.kind == "lost"):
+                    journal.append({"key": job.key, "id": job.scenario.id, "replays": asdict(result)})
                 found[job.scenario.id] = result
                 progress(len(found), len(scenarios))
     return found

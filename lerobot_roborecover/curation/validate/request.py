@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,10 @@ class ValidationRequest:
     """Ids whose rejection a person takes back."""
     by: str = "a person"
     """Who looked; goes into the decisions."""
-    workers: int = 1
+    workers: int = 0
+    """Processes that replay; 0 takes one, or all CPUs of a cluster."""
+    workplace: Workplace = HERE
+    """Where they are."""
     limit_s: float = 900.0
     """Longest that all replays of one scenario may take."""
     work: Path | None = None

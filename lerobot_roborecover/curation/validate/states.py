@@ -20,6 +20,7 @@ from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Scenario, ScenarioError
 from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 _SHOWN = 3
 
@@ -36,7 +37,11 @@ class StatesReport:
 
 
 def write_states(
-    root: Path, out: Path, workers: int = 1, progress: Callable[[int, int], None] = lambda done, total: None
+    root: Path,
+    out: Path,
+    workers: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    workplace: Workplace = HERE,
 ) -> StatesReport:
     """Writes a copy of a dataset whose scenarios all have the hash of their state at the recovery point.
 
@@ -46,20 +51,23 @@ def write_states(
     Args:
         root: the dataset's folder.
         out: folder of the copy, new or empty.
-        workers: processes that replay.
+        workers: processes that replay; 0 takes one, or all CPUs of a cluster.
         progress: called with the numbers of replays done and in all.
+        workplace: where they are.
 
     Raises:
         ScenarioError: a scenario cannot be replayed, two replays of it differ, it is elsewhere than it was
             recorded, or it has another hash; nothing is written then.
         SimulatorError: the simulator cannot be made, or a worker process died.
     """
+    workplace.check()
     scenarios, manifest = read_with_manifest(root)
     with tempfile.TemporaryDirectory() as work:
 
         def replay(order: Sequence[Scenario], turn: int) -> list[Replayed]:
             return fingerprint_scenarios(
                 order, Path(work) / f"{turn}.jsonl", options={"obs_type": "state"}, workers=workers,
+                workplace=workplace,
                 progress=lambda done, total: progress(turn * total + done, 2 * total),
             )  # fmt: skip
 

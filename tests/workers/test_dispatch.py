@@ -1,0 +1,109 @@
+"""Work given to slots that may be opening, and whose machines may be lost; the slots are stand-ins."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lerobot_roborecover.workers.dispatch import each, in_order
+from lerobot_roborecover.workers.messages import More, SlotFailure
+from lerobot_roborecover.workers.slots import MOST_LOSSES
+
+
+class FragileSlot:
+    """A slot that is lost when the fates say so, and opens again after some looks.
+
+    Args:
+        fates: how each command ends, one after the other over all slots; `done` once there are none left.
+        given: counts how often each argument was sent.
+        opening: looks that it takes to open.
+    """
+
+    deadline = float("inf")
+
+    def __init__(self, fates, given, opening):
+        self._fates, self._given, self._takes = fates, given, opening
+        self._left = opening
+        self._argument = None
+        self.ended = 0
+
+    opening = property(lambda self: self._left > 0)
+    ready = property(lambda self: self)
+
+    @staticmethod
+    def wait(handles, _timeout_s):
+        return handles[:1]
+
+    def opened(self):
+        assert self.opening
+        self._left -= 1
+
+    def send(self, command, argument=None):
+        assert not self.opening, "a slot that is not there was asked"
+        assert command == "run"
+        if argument is not None:
+            self._given[argument] += 1
+            self._argument = argument
+
+    def receive(self):
+        fate = next(self._fates, "done")
+        if fate == "lost":
+            self._left = self._takes
+            return SlotFailure("lost", "the node is gone")
+        return {"done": self._argument, "more": More(), "died": SlotFailure("died", "it died")}[fate]
+
+    def end(self):
+        self.ended += 1
+
+
+def slots_of(openings, fates, counts):
+    fates = iter(fates)
+    return [FragileSlot(fates, counts, opening) for opening in openings]
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    openings=st.lists(st.integers(0, 3), min_size=1, max_size=4),
+    fates=st.lists(st.sampled_from(["done", "done", "lost", "died", "more"]), max_size=40),
+    count=st.integers(0, 12),
+)
+def test_every_item_ends_once_and_is_lost_no_more_often_than_that(openings, fates, count):
+    counts: Counter[int] = Counter()
+    left = iter(range(count))
+    found = list(
+        each(slots_of(openings, fates, counts), "run", lambda *_: next(left, None), lambda item: item)
+    )
+    assert sorted(item for item, _ in found) == list(range(count))
+    assert all(n <= MOST_LOSSES for n in counts.values())
+    for item, reply in found:
+        if reply == item:
+            continue
+        assert isinstance(reply, SlotFailure)
+        if reply.kind == "lost":
+            assert counts[item] == MOST_LOSSES
+            assert reply.message == "lost 3 times, last: the node is gone"
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    openings=st.lists(st.integers(0, 3), min_size=1, max_size=4),
+    losses=st.lists(st.booleans(), max_size=12),
+    count=st.integers(0, 12),
+)
+def test_the_order_stays_whatever_is_lost(openings, losses, count):
+    fates = [fate for lost in losses for fate in (["lost", "done", "done"] if lost else ["done"])]
+    given_out: Counter[int] = Counter()
+    slots = slots_of(openings, fates, given_out)
+    assert list(in_order(slots, "run", range(100, 100 + count), lambda n: n)) == [*range(100, 100 + count)]
+
+
+def test_what_died_by_itself_is_not_tried_again():
+    counts: Counter[int] = Counter()
+    left = iter(range(3))
+    (slot,) = slots_of([0], ["done", "died", "done"], counts)
+    found = dict(each([slot], "run", lambda *_: next(left, None), lambda item: item, fresh=True))
+    assert found == {0: 0, 1: SlotFailure("died", "it died"), 2: 2}
+    assert set(counts.values()) == {1}
+    assert slot.ended == 3, "a fresh process for each"
