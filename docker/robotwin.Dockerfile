@@ -20,7 +20,7 @@ RUN apt-get update \
         ffmpeg g++ git libegl1 libgl1 libglvnd0 libvulkan1 libx11-6 libxext6 unzip \
     && rm -rf /var/lib/apt/lists/*
 
-RUN pip install --no-cache-dir uv
+RUN pip install --no-cache-dir uv==0.13.9
 
 # The commit that LeRobot 0.6.1 pins.
 ARG ROBOTWIN_COMMIT=0aeea2d669c0f8516f4d5785f0aa33ba812c14b4
@@ -34,11 +34,12 @@ COPY . .
 RUN uv pip install --system --no-cache -c constraints.txt -e ".[robotwin]"
 
 # Robot and object models, some GB. Background textures (11 GB) are for `demo_randomized` alone: add background_texture.
-RUN cd "$ROBOTWIN_ROOT/assets" \
-    && for archive in embodiments objects; do \
+WORKDIR $ROBOTWIN_ROOT/assets
+RUN for archive in embodiments objects; do \
         hf download TianxingChen/RoboTwin2.0 "$archive.zip" --repo-type dataset --local-dir . \
         && unzip -q "$archive.zip" && rm "$archive.zip" || exit 1; \
     done \
     && rm -rf .cache
 
+WORKDIR /opt/roborecover
 CMD ["roborecover", "doctor", "--platform", "robotwin"]

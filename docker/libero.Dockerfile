@@ -1,0 +1,47 @@
+# LIBERO on a machine with an NVIDIA GPU, with the policy families that LeRobot has. From the root of this repository:
+#
+#     docker build -f docker/libero.Dockerfile -t roborecover-libero .
+#     docker run --rm --gpus all roborecover-libero         # roborecover doctor --platform libero
+#     docker run --rm --gpus all -v "$PWD/outputs:/lerobot/outputs" roborecover-libero \
+#         roborecover reproduce pi05_libero --set policy.device=cuda
+#
+# The host needs the NVIDIA Container Toolkit, and a driver that PyTorch's CUDA wheels run on. As LeRobot's images:
+# /lerobot with a virtual environment, the user user_lerobot. The base is pinned by its tag.
+FROM python:3.12-slim-bookworm
+
+# `graphics` has the toolkit mount the driver's EGL part as well.
+ENV DEBIAN_FRONTEND=noninteractive \
+    MUJOCO_GL=egl \
+    NVIDIA_VISIBLE_DEVICES=all \
+    NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics \
+    PATH=/lerobot/.venv/bin:$PATH
+
+# What builds egl_probe, which LIBERO asks for and which has no wheels; OpenGL; FFmpeg for torchcodec.
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends \
+        cmake ffmpeg g++ git libegl1 libgl1 libglvnd0 make \
+    && rm -rf /var/lib/apt/lists/* \
+    && pip install --no-cache-dir uv==0.13.9 \
+    && useradd --uid 1000 --create-home --shell /bin/bash user_lerobot \
+    && mkdir /lerobot \
+    && chown user_lerobot:user_lerobot /lerobot
+
+USER 1000
+WORKDIR /lerobot
+ENV HOME=/home/user_lerobot \
+    HF_HOME=/home/user_lerobot/.cache/huggingface \
+    ROBORECOVER_LIBERO_ASSETS=/home/user_lerobot/libero_assets \
+    CMAKE_POLICY_VERSION_MINIMUM=3.5
+
+COPY --chown=user_lerobot:user_lerobot . .
+RUN uv venv --python 3.12 \
+    && uv pip install --no-cache --compile-bytecode -c constraints.txt -e ".[libero,policies,remote]" \
+    && mkdir -p outputs
+
+# A tag or commit of the dataset makes the image repeatable.
+ARG LIBERO_ASSETS_REVISION=main
+RUN hf download lerobot/libero-assets --repo-type dataset --revision "$LIBERO_ASSETS_REVISION" \
+        --local-dir "$ROBORECOVER_LIBERO_ASSETS" \
+    && rm -rf "$ROBORECOVER_LIBERO_ASSETS/.cache"
+
+CMD ["roborecover", "doctor", "--platform", "libero"]
