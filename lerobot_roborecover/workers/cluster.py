@@ -8,6 +8,7 @@ another slot. Nothing that has finished depends on the cluster: what comes back 
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,6 +30,9 @@ except ImportError as err:
 
 MOST_OPENINGS = 3
 """How often in a row an actor may fail to open: a node may go while it starts, but not every time."""
+
+
+_KNOCK_S = 20.0
 
 
 class ActorGoneError(RuntimeError):
@@ -239,6 +243,13 @@ def decisive_versions(platform: str) -> dict[str, str]:
     return found | {name: installed(name) or "" for name in (required(platform) if platform else ())}
 
 
+def _knock(address: str) -> None:
+    """Raises an `OSError` where nobody answers at HOST:PORT, which Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    if "/" not in host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S).close()
+
+
 class Cluster:
     """A Ray cluster that a pool's slots are on, joined as long as the pool is open.
 
@@ -255,8 +266,9 @@ class Cluster:
         if not ray.is_initialized():
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             try:
+                _knock(workplace.address)
                 ray.init(address=workplace.address, log_to_driver=False)
-            except (ConnectionError, RuntimeError, ValueError) as err:
+            except (OSError, RuntimeError, ValueError) as err:
                 option = workplace.option
                 raise OptionError(
                     f"{option('ray_address')}={workplace.address}: no Ray cluster there ({err}). Start one "

@@ -241,3 +241,23 @@ def test_too_many_are_refused_with_the_option(cluster, run, tmp_path, capsys):
     assert (
         "9 simulators need 9 CPUs; the Ray cluster has 4. Use --slots=4 or fewer" in capsys.readouterr().err
     )
+
+
+def test_the_command_joins_a_cluster_and_leaves_it(cluster, run, tmp_path, capsys):
+    import ray
+
+    cluster.complete()
+    policy = save_policy(tmp_path / "policy")
+    asked = [f"--policy.path={policy}", "--seeds=0", "--frames=none", "--env.obs_type=state", "--engine=ray"]
+    ray.shutdown()
+    try:
+        assert run(*arguments(tmp_path / "out", *asked, f"--ray-address={cluster.address}")) in (0, 1)
+        assert len(journal(tmp_path / "out.work" / "rollouts.jsonl")) == 2
+        assert not ray.is_initialized()
+        capsys.readouterr()
+        assert run(*arguments(tmp_path / "none", *asked, "--ray-address=127.0.0.1:1")) == 2
+        said = capsys.readouterr().err
+        assert "--ray-address=127.0.0.1:1: no Ray cluster there" in said
+        assert "--engine=local" in said
+    finally:
+        ray.init(address=cluster.address, log_to_driver=False, ignore_reinit_error=True)
