@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -12,7 +15,7 @@ from lerobot_roborecover.curation.collect.record import read_record
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.libero import goals
 from lerobot_roborecover.recording import PERTURBED, UNREACHABLE
-from lerobot_roborecover.scenario import Reset, Rollout, Task
+from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task
 from tests.support.factories import save_policy
 
 FAKE = ["collect", "--env.type=roborecover_fake", "--task=toy", "--horizon=25", "--slots=2"]
@@ -233,3 +236,21 @@ def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, c
     said = capsys.readouterr().err
     assert "can drive none of these tasks" in said
     assert "--policy.path=CHECKPOINT" in said
+
+
+def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_path, monkeypatch):
+    """As where a cluster's machine with the policy is lost for good."""
+    from lerobot_roborecover.curation.collect.rollouts import run_policy
+
+    class Away:
+        unrun: ClassVar = {("toy-p-s0", 0): "nobody answers"}
+
+        def run(self, units):
+            assert [u.scenario.seed for u in units] == [0]
+
+    monkeypatch.setattr("lerobot_roborecover.trials.places.open_engine", lambda *_: Away())
+    planned = SimpleNamespace(seed=0, trial=0, driver="p")
+    with pytest.raises(
+        ScenarioError, match=r"1 rollout could not be run.*nobody answers.*command again"
+    ):
+        run_policy([[planned]], None, None, None, 7, lambda ended, record: None)

@@ -17,6 +17,7 @@ from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.dispatch import each
 from lerobot_roborecover.workers.messages import SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool
@@ -145,6 +146,9 @@ def run_policy(
         places: where, `trials.places.EnginePlaces`.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
         on_end: told of each.
+
+    Raises:
+        ScenarioError: the policy went away, so that some were not driven.
     """
     from lerobot_roborecover.trials.places import open_engine
 
@@ -162,3 +166,9 @@ def run_policy(
     engine = open_engine(run, max(units, key=len), make_host, places)
     for wanted in units:
         engine.run(wanted)
+        if engine.unrun:
+            (name, _), reason = next(iter(engine.unrun.items()))
+            raise ScenarioError(
+                f"{counted(len(engine.unrun), 'rollout')} could not be run: the policy was away ({name}: "
+                f"{reason}). What has ended is kept: once the policy is back, run the same command again"
+            )
