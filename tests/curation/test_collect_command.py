@@ -250,7 +250,5 @@ def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_pa
 
     monkeypatch.setattr("lerobot_roborecover.trials.places.open_engine", lambda *_: Away())
     planned = SimpleNamespace(seed=0, trial=0, driver="p")
-    with pytest.raises(
-        ScenarioError, match=r"1 rollout could not be run.*nobody answers.*command again"
-    ):
+    with pytest.raises(ScenarioError, match=r"1 rollout could not be run.*nobody answers.*command again"):
         run_policy([[planned]], None, None, None, 7, lambda ended, record: None)
