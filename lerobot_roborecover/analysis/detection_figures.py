@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.detection import NEEDS_HELP, DetectionReport, ScoredTrial
+from lerobot_roborecover.analysis.detection import NEEDS_HELP, DetectionReport, Ranking, ScoredTrial
+from lerobot_roborecover.analysis.monitor_curves import Curve
 from lerobot_roborecover.analysis.style import (
     INK,
     LINE,
@@ -49,44 +51,37 @@ def detection_figures(reports: Reports) -> list[Figure]:
 def _roc(reports: Reports) -> Figure:
     with drawing() as subplots:
         plot, axes = subplots(5.2, 4.6)
-        words = []
-        for i, (name, report) in enumerate(reports.items()):
-            ranking = report.rankings.get(NEEDS_HELP)
-            if ranking is None:
-                continue
-            area = number(ranking.roc.area.value, ".2f")
-            axes.plot(
-                ranking.roc.x,
-                ranking.roc.y,
-                dash(i),
-                color=colour(i),
-                lw=1.6,
-                label=f"{short(name, 22)} {area}",
-            )
-            words.append(f"{name} {area}")
+        words = _ranked(axes, reports, lambda ranking: ranking.roc)
         axes.plot([0, 1], [0, 1], ":", color=SOFT, lw=1)
         axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="false-positive rate", ylabel="recall")
         _finish(axes, "lower right")
-    return Figure("detectors_roc", "Who needs help: ROC, with the area", "; ".join(words), plot)
+    return Figure("detectors_roc", "Who needs help: ROC, with the area", words, plot)
 
 
 def _precision(reports: Reports) -> Figure:
     with drawing() as subplots:
         plot, axes = subplots(5.2, 4.6)
-        words = []
-        for i, (name, report) in enumerate(reports.items()):
-            ranking = report.rankings.get(NEEDS_HELP)
-            if ranking is None:
-                continue
-            curve = ranking.precision_recall
-            area = number(curve.area.value, ".2f")
-            axes.plot(curve.x, curve.y, dash(i), color=colour(i), lw=1.6, label=f"{short(name, 22)} {area}")
-            axes.axhline(ranking.positive, color=SOFT, ls=":", lw=1)
-            words.append(f"{name} {area}")
+        words = _ranked(axes, reports, lambda ranking: ranking.precision_recall)
+        for report in reports.values():
+            if NEEDS_HELP in report.rankings:
+                axes.axhline(report.rankings[NEEDS_HELP].positive, color=SOFT, ls=":", lw=1)
         axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
         _finish(axes, "lower left")
     title = "Who needs help: precision and recall, with the area; dotted: share of frames"
-    return Figure("detectors_precision_recall", title, "; ".join(words), plot)
+    return Figure("detectors_precision_recall", title, words, plot)
+
+
+def _ranked(axes: Any, reports: Reports, curve_of: Callable[[Ranking], Curve]) -> str:
+    """One curve a detector that ranks at all, each with its area; the same in words."""
+    words = []
+    for i, (name, report) in enumerate(reports.items()):
+        if NEEDS_HELP not in report.rankings:
+            continue
+        curve = curve_of(report.rankings[NEEDS_HELP])
+        area = number(curve.area.value, ".2f")
+        axes.plot(curve.x, curve.y, dash(i), color=colour(i), lw=1.6, label=f"{short(name, 22)} {area}")
+        words.append(f"{name} {area}")
+    return "; ".join(words)
 
 
 def _delays(reports: Reports) -> Figure:

@@ -109,7 +109,7 @@ class LiberoHand(Hand):
         return self._scene.center_m(self._goal.region)
 
     def other(self) -> np.ndarray:
-        """The nearest other object that belongs nowhere else."""
+        """The nearest other object."""
         here = self.object()
         rest = [self._scene.position_m(n) for n in self._scene.objects if n != self._goal.item]
         if not rest:

@@ -24,6 +24,7 @@ from lerobot_roborecover.platforms.libero.expert import Flaws, LiberoExpert
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+from lerobot_roborecover.platforms.simulator import is_mark
 from lerobot_roborecover.recording import PERTURBED, Recorder, Steps
 from lerobot_roborecover.replay import hand_off, with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
@@ -124,7 +125,7 @@ def _provenance(recipe: Recipe, seen: Steps, proof_steps: int) -> dict:
     for body, poses in seen.bodies.items():
         path = poses[: recipe.step + 1, :3]
         distance = float(np.linalg.norm(path[-1] - path[PLATFORM.settle_steps]))
-        if not body.startswith("eef") and distance > _MOVED_M:
+        if not (body.startswith("eef") or is_mark(body)) and distance > _MOVED_M:
             moved[body] = round(distance, 3)
     return {
         "made_by": "recipes.libero.starter",

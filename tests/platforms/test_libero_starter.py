@@ -88,3 +88,17 @@ def test_a_recipe_makes_its_scenario_again(scenarios, simulator):
     # The driver looks at where things are: another processor rounds otherwise (see `exactness`).
     np.testing.assert_allclose(again.rollout.actions, shipped.prefix, rtol=0, atol=1e-6)
     assert prove(simulator, shipped) == shipped.provenance["proof"]["steps"]
+
+
+def test_marks_are_not_among_what_moved():
+    from lerobot_roborecover.recording import Steps
+    from recipes.libero.recipes import RECIPES
+    from recipes.libero.starter import _provenance
+
+    recipe = RECIPES[0]
+    path = np.zeros((recipe.step + 1, 7))
+    path[-1, 0] = 0.1
+    bodies = dict.fromkeys(("eef", "plate_1_main", "bowl_1_main.goal"), path)
+    count = recipe.step
+    seen = Steps(bodies, np.zeros(count + 1, bool), np.zeros(count, np.int8))
+    assert _provenance(recipe, seen, 5)["moved_m"] == {"plate_1_main": 0.1}

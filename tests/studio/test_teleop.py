@@ -307,6 +307,20 @@ def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_pa
     store.close()
 
 
+def test_a_recording_of_before_the_simulator_marked_more_still_replays():
+    from lerobot_roborecover.studio.teleop.write import _replay
+
+    simulator = make_simulator("fake")
+    session = TeleopSession(simulator, "ann")
+    session.start(first_state("fake", "push-left", seed=5))
+    for _ in range(4):
+        session.act(np.full(2, 0.5), "keyboard")
+    whole = session.recorded("it", as_dropped=True)
+    earlier = replace(whole, bodies={name: whole.bodies[name] for name in list(whole.bodies)[:1]})
+    assert len(earlier.bodies) < len(simulator.bodies())
+    assert _replay(earlier, simulator)[0] == 0.0
+
+
 # --- starts and pictures
 
 

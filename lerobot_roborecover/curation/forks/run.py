@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.host import Host
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import unfinished
-from lerobot_roborecover.trials.local import open_local_engine
+from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.units import Unit
 
 if TYPE_CHECKING:
@@ -161,10 +162,9 @@ def _run_arm(
         on_fork(arm.kind, done[0], len(units))
 
     if todo:
-        slots = request.slots or _slots(config)
-        open_local_engine(
-            run, todo, lambda: _host(request, env, config, arm), slots, _drawing(env, config), on_row=told
-        ).run(todo)
+        places = EnginePlaces(slots=request.slots, device=str(config.device), draws=env.obs_type != "state")
+        make_host = partial(_host, request, env, config, arm)
+        open_engine(run, todo, make_host, places, on_row=told).run(todo)
     keys = set(run.keys([(u.scenario, u.trial) for u in units]))
     return [row for row in run.kept_log().rows if row.key() in keys]
 
@@ -181,20 +181,6 @@ def _host(request: ForkRequest, env: RecoveryEnvConfig, config: PreTrainedConfig
             "what it remembers cannot be continued on another. Fork trials of the checkpoint itself"
         )
     return LeadHost(host)
-
-
-def _slots(config: PreTrainedConfig) -> int:
-    from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
-
-    return default_slots(str(config.device), usable_cores(), available_gb())
-
-
-def _drawing(env: RecoveryEnvConfig, config: PreTrainedConfig) -> Mapping[str, str | None] | None:
-    from lerobot_roborecover.env.render_device import egl_devices, render_environment
-
-    if env.obs_type == "state":
-        return None
-    return render_environment("auto", str(config.device), egl_devices())
 
 
 def _env(request: ForkRequest, row: TrialRow, ids: Sequence[str]) -> RecoveryEnvConfig:

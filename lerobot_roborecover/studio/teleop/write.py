@@ -182,8 +182,9 @@ def _replay(recorded: Recorded, simulator: Simulator) -> tuple[float, np.ndarray
     largest, solved = 0.0, np.zeros(len(recorded.actions) + 1, bool)
     for step in walk(simulator, recorded.rollout):
         solved[step] = simulator.succeeded()
-        for name, pose in simulator.bodies().items():
-            gap = np.linalg.norm(np.subtract(pose.position_m, recorded.bodies[name][step, :3]))
+        now = simulator.bodies()  # of a later version: it may mark more than was recorded
+        for name, poses in recorded.bodies.items():
+            gap = np.linalg.norm(np.subtract(now[name].position_m, poses[step, :3]))
             largest = max(largest, float(gap))
     return largest, solved
 
