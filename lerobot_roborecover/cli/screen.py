@@ -41,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-invalid", type=int, default=0, metavar="N",
         help="invalid trials that a scenario may have; they count as failures (%(default)s)",
     )  # fmt: skip
+    add(
+        "--curtail", action="store_true",
+        help="stop trying a scenario once no further trial could change whether it stays (after three, which "
+        "validation replays): the same scenarios stay after fewer trials; deterministic policies come first",
+    )  # fmt: skip
     add("--trials-folder", type=Path, metavar="DIR", help="trials, kept between runs (OUT.trials)")
     add(
         "--trials-from", action="append", default=[], type=Path, metavar="DIR",
@@ -93,7 +98,7 @@ def request(args: argparse.Namespace) -> ScreenRequest:
         policies=policies,
         out=args.out,
         trials_folder=args.trials_folder,
-        rule=ScreenRule(args.trials, tuple(args.keep), args.max_invalid),
+        rule=ScreenRule(args.trials, tuple(args.keep), args.max_invalid, args.curtail),
         deterministic=args.deterministic,
         run_seed=args.run_seed,
         env=env,

@@ -6,7 +6,7 @@ be replayed: for the monitor's frames, or as a demonstration. A rerun goes on wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ def run_trials(
     folder: Path,
     *,
     trials: int = 1,
+    only: Collection[str] | None = None,
     seed: int = 1000,
     device: str | None = None,
     slots: int = 0,
@@ -63,6 +64,7 @@ def run_trials(
         env: a recovery env config (`env_config`), which names the scenarios and the observations.
         folder: of this policy alone: trial log and actions.
         trials: per scenario.
+        only: ids of scenarios; None takes all.
         seed: of the run.
         device: of the policy; None takes what its config says.
         slots: simulators at work at once; 0 takes as many as there is room for.
@@ -87,7 +89,8 @@ def run_trials(
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=seed)
-    units = units_of(sorted(scenarios, key=lambda s: s.id), trials)
+    chosen = [s for s in scenarios if only is None or s.id in only]
+    units = units_of(sorted(chosen, key=lambda s: s.id), trials)
     hash_ = run.protocol.config_hash()
     keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
     run.pool.acquire()

@@ -22,8 +22,11 @@ from lerobot_roborecover.curation.screen.screening import (
     ScreenRule,
     format_histogram,
     format_policies,
+    format_settled,
     histogram,
+    provenance_of,
     screen,
+    tally,
 )
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
@@ -134,6 +137,64 @@ def test_one_trial_of_a_deterministic_policy_stands_for_all(same, noisy):
     kept = (found.successes, found.trials, found.decision.verdict, found.decision.reason)
     assert kept == (whole.successes, whole.trials, whole.decision.verdict, whole.decision.reason)
     assert found.counts["a"].trials == 1
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_curtailing_keeps_the_same_scenarios(data):
+    """Whatever the trials' outcomes and order, as soon as a verdict is settled it is that of all trials."""
+    scenario, rule = fake_scenario(0), ScreenRule(curtail=True)
+    certain = data.draw(st.sets(st.sampled_from("abc")))
+    wins = {n: data.draw(st.sampled_from([0, 5]) if n in certain else st.integers(0, 5)) for n in NAMES}
+    rows = rows_with(scenario, wins)
+    (whole,) = screen([scenario], rows, ScreenRule(), certain)
+    order = data.draw(st.permutations([r for n in NAMES for r in rows[n][: 1 if n in certain else 5]]))
+    seen, settled, soonest = {name: [] for name in NAMES}, False, 0
+    for run, row in enumerate(order, start=1):
+        (before,) = tally([scenario], seen, rule, certain)
+        soonest = max(soonest, run - 1 + before.soonest) if not certain else soonest
+        seen[row.policy[0]].append(row)
+        (found,) = tally([scenario], seen, rule, certain)
+        if found.settled:
+            assert run >= 3
+            assert run >= soonest
+            assert screen([scenario], seen, rule, certain)[0].decision.reason == whole.decision.reason
+            settled = True
+        else:
+            assert not settled, "a settled verdict stays settled"
+            with pytest.raises(ScenarioError, match="run the command again"):
+                screen([scenario], seen, rule, certain)
+    assert found.complete
+    assert provenance_of(found, 0) == provenance_of(whole, 0)
+
+
+def test_where_a_curtailed_screening_stops():
+    scenario, rule = fake_scenario(0), ScreenRule(curtail=True)
+    rows = {name: [] for name in NAMES}
+    (none,) = tally([scenario], rows, rule, "abc")
+    assert (none.settled, none.soonest) == (False, 4)
+    # One success and one failure of those that count five times each settle it, once there are three.
+    mixed = rows_with(scenario, {"a": 5, "b": 0, "c": 0, "d": 0}, trials=1) | {"d": []}
+    (found,) = screen([scenario], mixed, rule, "abc")
+    assert (found.settled, found.soonest, found.complete) == (True, 0, False)
+    assert (
+        found.decision.detail
+        == "5 of 15 successes (a 1/1 (x 5), b 0/1 (x 5), c 0/1 (x 5), d 0/0); 2 to 18 of 20 stay"
+    )
+    assert provenance_of(found, 0)["planned"] == 20
+    # Three that never recover leave it to the fourth: two successes keep it, four failures drop it.
+    never = rows_with(scenario, dict.fromkeys(NAMES, 0), trials=1) | {"d": []}
+    (found,) = tally([scenario], never, rule, "abc")
+    assert (found.settled, found.soonest) == (False, 2)
+    lost = never | {"d": rows_with(scenario, dict.fromkeys(NAMES, 0), trials=4)["d"]}
+    (found,) = screen([scenario], lost, rule, "abc")
+    assert found.decision.reason == "too hard"
+    both = [*screen([scenario], mixed, rule, "abc"), found]
+    assert [line.split() for line in format_settled(both).splitlines()] == [
+        ["trials", "stays", "too", "hard"], ["3", "1", "0"], ["7", "0", "1"],
+    ]  # fmt: skip
+    table = format_policies(both)
+    assert re.search(r"^d +n/a \(curtailed\)", table, re.M), table
 
 
 def test_a_policy_that_is_not_deterministic_is_found_out_where_it_has_more_trials():
@@ -272,6 +333,32 @@ def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, t
     assert what_it_says(tmp_path / "out") == what_it_says(screened)
     assert "0.0" in capsys.readouterr().out
     assert take_trials(tmp_path / "part-0" / "calm", tmp_path / "out.trials" / "calm") == 0
+
+
+@pytest.mark.lerobot
+def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):
+    from tests.support.push_checkpoints import load_push_host
+
+    monkeypatch.setattr("lerobot_roborecover.trials.load.load_host", load_push_host)
+    assert main(command(scenario_set, checkpoints, tmp_path / "out", "--curtail")) == 0
+    assert "stays" in capsys.readouterr().out
+    ids = {s.id for s in read_scenarios(screened)}
+    assert {s.id for s in read_scenarios(tmp_path / "out")} == ids
+
+    def run(folder: Path) -> int:
+        return sum(len(read_trial_log(folder / p.name / "trials.jsonl")) for p in checkpoints)
+
+    all_trials = run(screened.with_name("out.trials"))
+    assert 3 * 8 <= run(tmp_path / "out.trials") < all_trials
+    # Shards, the other order of policies, and trials that are there already keep the same ones.
+    parts = []
+    for k in range(2):
+        part = tmp_path / f"part-{k}"
+        more = ("--curtail", "--shard", f"{k}/2", "--trials-folder", str(part))
+        assert main(command(scenario_set, checkpoints[::-1], tmp_path / "never", *more)) == 0
+        parts += ["--trials-from", str(part)]
+    assert main(command(scenario_set, checkpoints, tmp_path / "joined", "--curtail", *parts)) == 0
+    assert {s.id for s in read_scenarios(tmp_path / "joined")} == ids
 
 
 @pytest.mark.lerobot

@@ -95,6 +95,7 @@ class ScreenPart:
     trials: int | None = None
     keep: list[Any] | None = None
     max_invalid: int | None = None
+    curtail: bool | None = None
     run_seed: int | None = None
     device: str | None = None
     engine: str | None = None

@@ -156,8 +156,12 @@ def screen_rule(config: ChainConfig) -> ScreenRule:
     """
     part = config.screen
     keep = ScreenRule.keep if part.keep is None else (str(part.keep[0]), str(part.keep[1]))
+    rule = ScreenRule
     return ScreenRule(
-        given(part.trials, ScreenRule.trials), keep, given(part.max_invalid, ScreenRule.max_invalid)
+        given(part.trials, rule.trials),
+        keep,
+        given(part.max_invalid, rule.max_invalid),
+        given(part.curtail, rule.curtail),
     )
 
 

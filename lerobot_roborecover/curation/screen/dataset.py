@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -19,9 +19,11 @@ from lerobot_roborecover.curation.screen.screening import (
     ScreenRule,
     format_histogram,
     format_policies,
+    format_settled,
     histogram,
     provenance_of,
     screen,
+    tally,
 )
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios
@@ -123,23 +125,14 @@ def screen_dataset(
     if not request.shard:
         check_new(request.out)
     scenarios = load_scenarios(request.dataset)
-    rows: dict[str, list[TrialRow]] = {}
-    for number, policy in enumerate(request.policies):
+    for policy in request.policies:
         folder = request.trials / policy.name
         for other in request.trials_from:
             if (other / policy.name).is_dir():
                 take_trials(other / policy.name, folder)
         if request.retry:
             forget_trials(folder, request.retry)
-        count = 1 if policy.name in request.deterministic else request.rule.trials
-        trials = run_policy(
-            policy, request.dataset, scenarios.platform, request.trials, trials=count,
-            run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
-            slots=request.slots, max_batch=request.max_batch, replicas=request.replicas,
-            workplace=replace(request.workplace, fits=number > 0),
-            on_row=lambda row, done, total, name=policy.name: progress(name, done, total),
-        )  # fmt: skip
-        rows[policy.name] = [t.row for t in trials]
+    rows = _trials(request, scenarios, progress)
     if request.shard:
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic)
@@ -155,6 +148,48 @@ def screen_dataset(
     return Screening(found, rows)
 
 
+def _trials(
+    request: ScreenRequest, scenarios: Sequence[Scenario], progress: Callable[[str, int, int], None]
+) -> dict[str, list[TrialRow]]:
+    """Every trial that the verdicts need, by the policy's name.
+
+    A curtailed screening takes one policy after the other, those that need one trial only first, and as many
+    trials of each as may settle some verdict, of the scenarios that are open then.
+    """
+    platform, started = load_scenarios(request.dataset).platform, False
+    rows: dict[str, dict[tuple, TrialRow]] = {p.name: {} for p in request.policies}
+
+    def run(policy: PolicySpec, trials: int, only: Collection[str] | None) -> None:
+        nonlocal started
+        found = run_policy(
+            policy, request.dataset, platform, request.trials, trials=trials, only=only,
+            run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
+            slots=request.slots, max_batch=request.max_batch, replicas=request.replicas,
+            workplace=replace(request.workplace, fits=started),
+            on_row=lambda row, done, total: progress(policy.name, done, total),
+        )  # fmt: skip
+        started = True
+        rows[policy.name] |= {t.row.key(): t.row for t in found}
+
+    def counted_so_far() -> list[Screened]:
+        return tally(scenarios, {n: list(r.values()) for n, r in rows.items()}, rule, request.deterministic)
+
+    rule = request.rule
+    for policy in sorted(
+        request.policies, key=lambda p: rule.curtail and p.name not in request.deterministic
+    ):
+        most = 1 if policy.name in request.deterministic else rule.trials
+        trials = 0
+        while trials < most:
+            chosen = [s for s in counted_so_far() if not s.settled] if rule.curtail else None
+            if chosen == []:
+                break
+            soonest = min((s.soonest for s in chosen), default=most) if chosen else most
+            trials = min(trials + soonest, most)
+            run(policy, trials, None if chosen is None else [s.scenario.id for s in chosen])
+    return {name: list(of.values()) for name, of in rows.items()}
+
+
 def describe(request: ScreenRequest, made: Screening) -> str:
     """What came of a screening: the tables, the funnel, and the command that follows."""
     if request.shard:
@@ -168,7 +203,7 @@ def describe(request: ScreenRequest, made: Screening) -> str:
     )
     tables = (
         format_policies(made.found),
-        format_histogram(made.found, rule),
+        format_settled(made.found) if rule.curtail else format_histogram(made.found, rule),
         attrition_table(count_stages(read_decisions(request.out))),
     )
     return "\n\n".join((head, *tables, next_line(validate_next(request.out, request.trials))))
@@ -208,5 +243,5 @@ def _record(
             }
             for p in request.policies
         ],
-        "scenarios_by_successes": histogram(found),
+        **({} if request.rule.curtail else {"scenarios_by_successes": histogram(found)}),
     }

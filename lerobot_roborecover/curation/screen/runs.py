@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -168,6 +168,7 @@ def run_policy(
     folder: Path,
     *,
     trials: int,
+    only: Collection[str] | None = None,
     run_seed: int = 1000,
     env: Sequence[str] = (),
     shard: str = "",
@@ -186,6 +187,7 @@ def run_policy(
         platform: of the set.
         folder: of all policies' trials.
         trials: per scenario.
+        only: ids of scenarios; None takes all.
         run_seed: of the run.
         env: `name=value` options of the env type.
         shard: `k/n`, or empty for everything.
@@ -201,7 +203,7 @@ def run_policy(
     given = [*env, *policy.env, *([f"shard={shard}"] if shard else [])]
     config = env_config(platform, scenarios, [f"--{option}" for option in given])
     return run_trials(
-        policy.path, config, mine, trials=trials, seed=run_seed, device=device, slots=slots,
+        policy.path, config, mine, trials=trials, only=only, seed=run_seed, device=device, slots=slots,
         max_batch=max_batch, workplace=workplace, replicas=replicas,
         policy_options=[f"--{o}" for o in policy.options],
         rename_map=policy.rename_map, on_row=on_row,

@@ -3,6 +3,9 @@
 Each scenario is run from its recovery point by every policy several times; it stays where the successes of
 all policies together lie within bounds. The paper: four policies, five trials, 2 to 18 successes of 20, which
 is 10 % to 90 % ("Policy Difficulty Filtering"). Pure functions of trial rows.
+
+Trials that can no longer change a verdict need not be run (curtailed sampling): the verdicts are the same,
+only the counts are not complete.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
 KEEP = ("0.1", "0.9")
 """Shares of all trials (paper: a recovery rate between 10 % and 90 %); 2 to 18 of 20."""
+CURTAILED_LEAST = 3
+"""Trials that every scenario gets, however early its verdict is settled: as many as `validate` replays."""
 _BAR = 40
 
 
@@ -36,6 +41,8 @@ class ScreenRule:
     """Fewest and most successes that stay: two counts, or two shares of all trials (with a decimal point)."""
     max_invalid: int = 0
     """Invalid trials that a scenario may have; they count as failures. With more it is dropped."""
+    curtail: bool = False
+    """A scenario needs no more trials once they could not change its verdict, unless by being invalid."""
 
     def __post_init__(self):
         if self.trials < 1 or self.max_invalid < 0:
@@ -119,6 +126,42 @@ class Screened:
         return sum(c.trials * c.each_counts for c in self.counts.values())
 
     @property
+    def planned(self) -> int:
+        """Trials of the rule, of all policies."""
+        return len(self.counts) * self.rule.trials
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of them have been run."""
+        return self.trials >= self.planned
+
+    @property
+    def settled(self) -> bool:
+        """Whether trials that have not been run could not change the verdict, and there are enough of them to
+        validate with."""
+        return self.complete or (self._run >= CURTAILED_LEAST and self._settled_by(0, 0))
+
+    @property
+    def soonest(self) -> int:
+        """How many more trials, counting once each, can settle the verdict at best; 0 where it is settled."""
+        left = self.planned - self.trials
+        least = 0 if self.settled else max(1, CURTAILED_LEAST - self._run)
+        for more in range(least, left):
+            if any(self._settled_by(successes, more) for successes in range(more + 1)):
+                return more
+        return max(left, 0)
+
+    @property
+    def _run(self) -> int:
+        return sum(c.trials for c in self.counts.values())
+
+    def _settled_by(self, successes: int, more: int) -> bool:
+        low, high = self.rule.check(len(self.counts))
+        won = self.successes + successes
+        could = won + self.planned - self.trials - more
+        return could < low or won > high or (low <= won and could <= high)
+
+    @property
     def invalid(self) -> Counter[str]:
         """Invalid trials of all policies, by outcome."""
         found: Counter[str] = Counter()
@@ -134,7 +177,8 @@ class Screened:
             f"{name} {c.successes}/{c.trials}{f' (x {c.each_counts})' if c.each_counts > 1 else ''}"
             for name, c in self.counts.items()
         )
-        detail = f"{self.successes} of {self.trials} successes ({each}); {low} to {high} stay"
+        total = "" if self.complete else f" of {self.planned}"
+        detail = f"{self.successes} of {self.trials} successes ({each}); {low} to {high}{total} stay"
         if self.invalid:
             named = sorted(self.invalid.items())
             detail += "; invalid: " + ", ".join(f"{n} {outcome}" for outcome, n in named)
@@ -168,7 +212,33 @@ def screen(
         One result a scenario, in their order.
 
     Raises:
-        ScenarioError: a scenario lacks a trial of a policy, or two trials of a deterministic one differ.
+        ScenarioError: a scenario lacks a trial that its verdict needs, or two trials of a deterministic
+            policy differ.
+    """
+    found = tally(scenarios, rows, rule, deterministic)
+    for one in found:
+        if one.complete or (rule.curtail and one.settled):
+            continue
+        for name, count in one.counts.items():
+            needed = 1 if name in deterministic else rule.trials
+            if count.trials < needed:
+                raise ScenarioError(
+                    f"scenario {one.scenario.id} has {count.trials} of {needed} trials by {name}; run the "
+                    "command again to finish them"
+                )
+    return found
+
+
+def tally(
+    scenarios: Sequence[Scenario],
+    rows: Mapping[str, Sequence[TrialRow]],
+    rule: ScreenRule,
+    deterministic: Collection[str] = (),
+) -> list[Screened]:
+    """Counts the trials that there are, whether or not they suffice; arguments are those of `screen`.
+
+    Raises:
+        ScenarioError: two trials of a deterministic policy differ.
     """
     rule.check(len(rows))
     of: dict[tuple[str, str, str], dict[int, TrialRow]] = defaultdict(dict)
@@ -182,13 +252,7 @@ def screen(
         for name in sorted(rows):
             mine = of[name, scenario.id, scenario.sha256()]
             found, each_counts = [mine[trial] for trial in sorted(mine)], 1
-            needed = 1 if name in deterministic else rule.trials
-            if len(found) < needed:
-                raise ScenarioError(
-                    f"scenario {scenario.id} has {len(found)} of {needed} trials by {name}; run the "
-                    "command again to finish them"
-                )
-            if name in deterministic:
+            if name in deterministic and found:
                 found, each_counts = [_the_one(name, found)], rule.trials
             counts[name] = _count(found, each_counts)
         result.append(Screened(scenario, counts, rule))
@@ -221,9 +285,11 @@ def _count(rows: Sequence[TrialRow], each_counts: int) -> PolicyCount:
 
 def provenance_of(found: Screened, run_seed: int) -> dict[str, Any]:
     """What a scenario keeps of its screening."""
+    planned = {} if found.complete else {"planned": found.planned}
     return {
         "successes": found.successes,
         "trials": found.trials,
+        **planned,
         "keep": list(found.rule.check(len(found.counts))),
         "run_seed": run_seed,
         "policies": {name: asdict(count) for name, count in found.counts.items()},
@@ -249,11 +315,24 @@ def format_histogram(found: Sequence[Screened], rule: ScreenRule) -> str:
     return "\n".join(lines)
 
 
+def format_settled(found: Sequence[Screened]) -> str:
+    """After how many trials verdicts were settled, as text; for a curtailed screening, whose counts of
+    successes are not complete."""
+    run = Counter((sum(c.trials for c in s.counts.values()), s.decision.reason or "stays") for s in found)
+    reasons = sorted({reason for _, reason in run}, key=lambda reason: (reason != "stays", reason))
+    lines = ["  ".join([f"{'trials':>9}", *(f"{reason:>9}" for reason in reasons)])]
+    for trials in sorted({trials for trials, _ in run}):
+        cells = (f"{run[trials, reason]:>{max(9, len(reason))}}" for reason in reasons)
+        lines.append("  ".join([f"{trials:>9}", *cells]))
+    return "\n".join(lines)
+
+
 def format_policies(found: Sequence[Screened]) -> str:
     """Each policy's recovery rate over all screened scenarios, and over those that stay, as text.
 
     Rates weigh scenarios equally; intervals are those of every table (`analysis/intervals.py`), over the
-    platform's units.
+    platform's units. A policy that has not tried every scenario as often as the rule says has no rate: those
+    that it tried are those that others left open.
     """
     kept = [s for s in found if s.decision.verdict == "kept"]
     names = sorted({name for s in found for name in s.counts})
@@ -278,6 +357,8 @@ def _rate(found: Sequence[Screened], policy: str) -> str:
     if not found:
         return "n/a"
     counts = [s.counts[policy] for s in found]
+    if any(s.counts[policy].trials * s.counts[policy].each_counts < s.rule.trials for s in found):
+        return "n/a (curtailed)"
     rates = np.array([c.successes / c.trials for c in counts])
     scenarios = [s.scenario for s in found]
     unit = default_unit(scenarios[0].task.platform)
