@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--rate", type=float, metavar="HZ", help="control steps a second, at most (the simulator's own rate)")
     add("--fps", type=float, default=15.0, help="live pictures a second, at most (%(default)s)")
     add("--view", type=int, default=320, metavar="PIXELS", help="size of the live pictures (%(default)s)")
-    add("--size", type=int, metavar="PIXELS", help="size of the dataset's pictures (the platform's own)")
+    add("--size", type=int, metavar="PIXELS", help="of the dataset's pictures; 0: none (the platform's own)")
     add(
         "--spacemouse", type=float, nargs="?", const=0.5, metavar="SPEED",
         help="drive with one that is plugged into this machine, too; SPEED is up to 1 (%(const)s)",
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         ("--size", args.size, 16, 2048),
         ("--spacemouse", args.spacemouse, 0.01, 1.0),
     ):
-        if value is not None and not low <= value <= high:
+        if value is not None and not (low <= value <= high or (option == "--size" and value == 0)):
             raise OptionError(f"{option} {value} is not from {low:g} to {high:g}")
     if not (args.write or args.operator):
         raise OptionError("--operator is missing: who drives, or a pseudonym")

@@ -164,7 +164,7 @@ def record(
         tasks: what to drive.
         init_states: of each way and task, in turn: each is tried until one succeeds.
         ways: of `DEVIATIONS`.
-        size: of the dataset's pictures.
+        size: of the dataset's pictures; 0 for none.
 
     Returns:
         Recordings by way.
@@ -181,8 +181,8 @@ def record(
                 state = init_states[(k + i) % len(init_states)]
                 starts.append(first_state("libero", task.name, task.suite, init_state=state))
     config = TeleopConfig(
-        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
-        options={"render_quality": "fast"},
+        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size,
+        film_every=FILM_EVERY if size else 1, options={"render_quality": "fast"},
     )  # fmt: skip
     simulator = LiberoSimulator(obs_type="state")
 
@@ -213,7 +213,7 @@ def main() -> None:
     add("--tasks", nargs="+", default=[""], metavar="PART", help="of suite/name; all that can be driven")
     add("--init-states", default="16-19", help="tried in turn until one succeeds (%(default)s)")
     add("--ways", nargs="+", choices=DEVIATIONS, default=list(DEVIATIONS), metavar="WAY")
-    add("--size", type=int, default=64, help="of the pictures (%(default)s)")
+    add("--size", type=int, default=64, help="of the pictures; 0 for none, numbers alone (%(default)s)")
     args = parser.parse_args()
     tasks = [
         t

@@ -40,7 +40,7 @@ class TeleopConfig:
     view_size: int = 320
     """Rows and columns of the live pictures."""
     size: int | None = None
-    """Rows and columns of the dataset's pictures; None for the platform's own."""
+    """Rows and columns of the dataset's pictures; None for the platform's own, 0 for none: numbers alone."""
     film_every: int = 1
     """Steps from one of the dataset's pictures to the next, where rendering is slow."""
     spacemouse: float | None = None

@@ -77,7 +77,7 @@ def write_dataset(
         store: the recordings.
         platform: their simulator.
         options: of the simulator, beside its pictures.
-        size: rows and columns of the pictures; None for the platform's own.
+        size: rows and columns of the pictures; None for the platform's own, 0 for none.
         say: told the progress.
         film_every: steps from one picture to the next; the last one stands until then.
 
