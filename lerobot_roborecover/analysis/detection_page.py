@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.detection import (
     DEVIATED,
     NEEDS_HELP,
@@ -24,6 +25,7 @@ from lerobot_roborecover.analysis.detection_figures import (
     finite,
     strip_figure,
 )
+from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
@@ -113,6 +115,30 @@ def _alarm_row(name: str, alarms: Alarms) -> tuple[Cell, ...]:
     )  # fmt: skip
 
 
+def pairs_of(measured: Sequence[MeasuredDetector], against: Sequence[str], level: float) -> list[Contrast]:
+    """Differences of pairs; the oracle, which reads outcomes, is in none."""
+    reports = {m.name: m.report for m in measured if m.what.split(",")[0] != "oracle"}
+    return detector_contrasts(reports, against=against, level=level)
+
+
+def pair_table(found: Sequence[Contrast], against: Sequence[str], level: float) -> Table | None:
+    """Which of two detectors ranks better, adjusted; None without a pair."""
+    if not found:
+        return None
+    columns = (
+        Column("A"), Column("B"), Column("AUROC, A − B", "points"), Column("p", "p"), Column("p (Holm)", "p"),
+        Column("Verdict"),
+    )  # fmt: skip
+    rows = tuple((c.a, c.b, c.difference, c.p, c.p_holm, c.verdict.value) for c in found)
+    notes = (
+        f"AUROC of needs help, paired over {found[0].units} scenarios by the jackknife; intervals are not "
+        f"adjusted, p (Holm) is, for {found[0].family} pairs"
+        + (f" with {' or '.join(against)}" if against else "")
+        + f". Verdict: p (Holm) below {1 - level:.3g}.",
+    )
+    return Table("pairs", "Which ranks better", columns, rows, notes)
+
+
 def input_table(measured: Sequence[MeasuredDetector]) -> Table:
     """What each of them is."""
     columns = (Column("Detector"), Column("What"), Column("Reads"), Column("Fitted to"), Column("Saved"))
@@ -130,6 +156,7 @@ def write_detection_report(
     level: float,
     seed: int,
     about: Mapping[str, Any],
+    against: Sequence[str] = (),
 ) -> Path:
     """Writes everything.
 
@@ -142,11 +169,15 @@ def write_detection_report(
         level: confidence level of the intervals.
         seed: of the halves of the scenarios.
         about: what was measured: policy, scenarios, command, versions.
+        against: detectors of which one is in every tested pair; empty for all pairs.
 
     Returns:
         The page.
     """
-    tables = [ranking_table(measured, level), alarm_table(measured, alpha), input_table(measured)]
+    found = pairs_of(measured, against, level)
+    pairs = pair_table(found, against, level)
+    tables = [ranking_table(measured, level), *([pairs] if pairs else []), alarm_table(measured, alpha)]
+    tables.append(input_table(measured))
     (out / "tables").mkdir(parents=True, exist_ok=True)
     for table in tables:
         (out / "tables" / f"{table.name}.csv").write_text(to_csv(table), encoding="utf-8")
@@ -166,6 +197,7 @@ def write_detection_report(
         "alpha": alpha,
         "level": level,
         "detectors": {m.name: detector_json(m) for m in measured},
+        "pairs": [_pair_json(c) for c in found],
     }
     (out / "detectors.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
     page = render_page(
@@ -176,9 +208,12 @@ def write_detection_report(
     return out / "detectors.html"
 
 
-def detection_text(measured: Sequence[MeasuredDetector], alpha: float, level: float) -> str:
+def detection_text(
+    measured: Sequence[MeasuredDetector], alpha: float, level: float, against: Sequence[str] = ()
+) -> str:
     """The tables for a terminal."""
-    tables = (ranking_table(measured, level), alarm_table(measured, alpha))
+    pairs = pair_table(pairs_of(measured, against, level), against, level)
+    tables = (ranking_table(measured, level), *([pairs] if pairs else []), alarm_table(measured, alpha))
     return "\n\n".join(to_text(replace(t, notes=())) for t in tables)
 
 
@@ -211,6 +246,13 @@ def detector_json(m: MeasuredDetector) -> dict[str, Any]:
         "conformal": _alarms_json(m.report.conformal),
         "own_decisions": None if m.report.own is None else _alarms_json(m.report.own),
     }
+
+
+def _pair_json(c: Contrast) -> dict[str, Any]:
+    return {
+        "a": c.a, "b": c.b, "auroc_difference": _estimate(c.difference), "p": _plain(c.p),
+        "p_holm": _plain(c.p_holm), "family": c.family, "verdict": c.verdict.value,
+    }  # fmt: skip
 
 
 def _alarms_json(alarms: Alarms) -> dict[str, Any]:

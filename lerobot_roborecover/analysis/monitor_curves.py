@@ -18,6 +18,10 @@ class Curve:
     y: np.ndarray
     thresholds: np.ndarray
     area: Estimate
+    left_out: np.ndarray
+    """(scenarios,) the area with each of them left out in turn."""
+    weights: np.ndarray
+    """(scenarios,) their frames on the curve."""
 
 
 def _ordered(frames: MonitorFrames, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -56,7 +60,9 @@ def precision_recall(frames: MonitorFrames, row: np.ndarray, level: float = LEVE
     recall, precision = curve(np.ones(len(rows)), float(missed.sum()))
     left_out = [average_precision(*curve(rows != i, float(missed.sum() - missed[i]))) for i in range(count)]
     area = _area(average_precision(recall, precision), left_out, deviated, level)
-    return Curve(recall, precision, score[last], area)
+    return Curve(
+        recall, precision, score[last], area, np.array(left_out, float), np.bincount(row, minlength=count)
+    )
 
 
 def roc(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
@@ -79,7 +85,8 @@ def roc(frames: MonitorFrames, row: np.ndarray, level: float = LEVEL) -> Curve:
     left_out = [under(*curve(rows != i)) for i in range(count)]
     by_label = [np.bincount(rows[label == one], minlength=count) for one in (0, 1)]
     area = _area(under(x, y), left_out, fewer(*by_label), level)
-    return Curve(x, y, np.insert(score[last], 0, np.inf), area)
+    thresholds = np.insert(score[last], 0, np.inf)
+    return Curve(x, y, thresholds, area, np.array(left_out, float), by_label[0] + by_label[1])
 
 
 def _area(value: float, left_out: list[float], weights: np.ndarray, level: float) -> Estimate:

@@ -68,6 +68,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--alpha", type=float, default=0.1,
         help="chance of a false alarm in a clean rollout that conformal thresholds allow (%(default)s)",
     )  # fmt: skip
+    add(
+        "--against", action="append", default=[], metavar="NAME",
+        help="test pairs with this detector alone; may be given again (all pairs)",
+    )  # fmt: skip
     add("--films", type=int, default=3, help="trials shown as film strips; 0 renders none (%(default)s)")
     add("--work", type=Path, help="folder of trials and observations, kept between runs (OUT.work)")
     add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
@@ -128,6 +132,7 @@ def _side_by_side(args: argparse.Namespace) -> int:
         base_model=args.base_model,
         level=args.level,
         seed=args.seed,
+        against=args.against,
     )
     found = compare_detectors(request, args.out, Progress("trial").of)
     strips, problem = film_strips(found.trials, choose_trials(found.trials, args.films))
@@ -144,9 +149,9 @@ def _side_by_side(args: argparse.Namespace) -> int:
     }
     page = write_detection_report(
         args.out, found.measured, found.scored, strips, alpha=args.alpha, level=args.level, seed=args.seed,
-        about=about,
+        about=about, against=args.against,
     )  # fmt: skip
-    print(detection_text(found.measured, args.alpha, args.level))
+    print(detection_text(found.measured, args.alpha, args.level, args.against))
     for remark in remarks:
         print(f"\nnote: {remark}", file=sys.stderr)
     for m in found.measured:

@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis.detection import (
     detection_report,
     frames_of,
 )
+from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 
 
 def trial(number: int, scores, *, start="recovery", success=False, handoff=0, decisions=None) -> ScoredTrial:
@@ -59,6 +60,61 @@ def test_halves_keep_units_together_and_are_halves():
     assert all(len(set(half[units == u])) == 1 for u in set(units))
     assert half.sum() == 30
     assert not np.array_equal(half, halves(units, 1))
+
+
+def noisy(rng, gap: float, units: int = 40) -> tuple[list[ScoredTrial], list[ScoredTrial]]:
+    """Two detectors' scores of the same trials; the second is `gap` better at failures."""
+    pair: tuple[list[ScoredTrial], list[ScoredTrial]] = [], []
+    for unit in range(units):
+        fails, shared = bool(rng.random() < 0.4), rng.normal(0, 0.7)
+        for start in ("recovery", "initial"):
+            helpless = fails and start == "recovery"
+            for trials, extra in zip(pair, (0.0, gap), strict=True):
+                scores = shared + rng.normal(0, 0.7) + rng.normal(0, 1, 12) + (1.0 + extra) * helpless
+                trials.append(trial(unit, scores, start=start, success=not helpless))
+    return pair
+
+
+def reports_of(**scored) -> dict:
+    return {
+        name: detection_report(trials, alpha=0.1, probabilities=False, decides=False)
+        for name, trials in scored.items()
+    }
+
+
+def test_pairs_of_detectors():
+    rng = np.random.default_rng(0)
+    worse, better = noisy(rng, 3.0)
+    reports = reports_of(worse=worse, better=better, same=worse)
+    found = {(c.a, c.b): c for c in detector_contrasts(reports)}
+    assert set(found) == {("worse", "better"), ("worse", "same"), ("better", "same")}
+    assert all(c.family == 3 and c.units == 40 for c in found.values())
+    alike, apart = found["worse", "same"], found["worse", "better"]
+    assert (alike.difference.value, alike.differing) == (0.0, 0)
+    assert not alike.verdict.separated
+    roc = {n: r.rankings[NEEDS_HELP].roc.area.value for n, r in reports.items()}
+    assert apart.difference.value == pytest.approx(roc["worse"] - roc["better"])
+    assert apart.verdict.value == "B is better"
+    assert apart.difference.high < 0
+    assert apart.p_holm >= apart.p
+    # Turned round, the same; with one detector in every pair, a smaller family.
+    turned = detector_contrasts(reports, against=["worse"])
+    assert [(c.a, c.b) for c in turned] == [("better", "worse"), ("same", "worse")]
+    assert turned[0].p == pytest.approx(apart.p)
+    assert (turned[0].difference.low, turned[0].family) == (pytest.approx(-apart.difference.high), 2)
+    # Nothing is said of a detector that says nothing.
+    silent = [trial(i, np.full(12, np.nan), success=bool(i % 2)) for i in range(80)]
+    assert detector_contrasts(reports_of(silent=silent, worse=worse)) == []
+
+
+@pytest.mark.nightly
+def test_detectors_alike_are_seldom_told_apart():
+    rng, wrong = np.random.default_rng(1), 0
+    for _ in range(200):
+        (c,) = detector_contrasts(reports_of(**dict(zip("ab", noisy(rng, 0.0), strict=True))))
+        assert (c.p < 0.05) == (c.difference.low > 0 or c.difference.high < 0)
+        wrong += c.p < 0.05
+    assert wrong <= 20, f"{wrong} of 200"  # of 5 %, more than 20 have a chance of 0.1 %
 
 
 def test_labels_say_who_needs_help():

@@ -67,6 +67,8 @@ class DetectionRequest:
     level: float = 0.95
     seed: int = 0
     """Of the halves of the scenarios."""
+    against: Sequence[str] = ()
+    """Names of detectors; pairs without one of them are not tested. Empty: all pairs are."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,9 @@ def compare_detectors(
         raise MonitorError(
             f"two detectors have one name: {[n.name for n in named]}; write --detector NAME=WHAT"
         )
+    unknown = sorted(set(request.against) - {n.name for n in named})
+    if unknown:
+        raise MonitorError(f"--against {unknown[0]!r:.80}: there are {', '.join(n.name for n in named)}")
     links = [ScenarioLink(s.id, s.sha256(), "") for s in scenarios]
     if not request.on_training_scenarios:
         for n in named:
