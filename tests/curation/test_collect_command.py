@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -82,6 +83,12 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
     touched = [*perturbed, shared, "--scene-touched=15", "--frames=32", "--slots=1"]
     assert main(arguments(tmp_path / "touched", *touched)) in (0, 1)
     assert "the disturbance did not touch the scene" in capsys.readouterr().out
+    # Only what failed is run again without the disturbance: what succeeded is dropped anyway.
+    rows = map(json.loads, (tmp_path / "one.work" / "rollouts.jsonl").read_text().splitlines())
+    ended = {row["rollout"]: row["outcome"] for row in rows}
+    twins = {n.removesuffix(".twin") for n in ended if n.endswith(".twin")}
+    assert twins == {n for n in ended if not n.endswith(".twin") and ended[n] != "success"}
+    assert twins
 
 
 @pytest.mark.lerobot

@@ -130,7 +130,7 @@ def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnE
 
 
 def run_policy(
-    passes: Sequence[Sequence[Planned]],
+    passes: Iterable[Sequence[Planned]],
     pool: SlotPool,
     make_host: Callable[[], Any],
     places: Any,
@@ -140,7 +140,8 @@ def run_policy(
     """Lets a policy drive, through the engine.
 
     Args:
-        passes: what to drive, one after the other; two in a pass have different ids.
+        passes: what to drive, one after the other, each asked for once the one before has ended; two in a
+            pass have different ids.
         pool: of slots with `collect_server.SERVER`.
         make_host: loads the policy.
         places: where, `trials.places.EnginePlaces`.
@@ -152,20 +153,18 @@ def run_policy(
     """
     from lerobot_roborecover.trials.places import open_engine
 
-    units = [[Unit(u, u.trial) for u in wanted] for wanted in passes]
-    if not any(units):
-        return
-
     def keep(trial: Trial, row: TrialRow) -> None:
         assert isinstance(trial.scenario, Planned)
         on_end(Ended(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment)
 
-    driver = next(u.driver for wanted in passes for u in wanted)
-    protocol = Protocol("recovery", 0, driver, seed, None)
-    run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
-    engine = open_engine(run, max(units, key=len), make_host, places)
-    for wanted in units:
-        engine.run(wanted)
+    for wanted in passes:
+        if not wanted:
+            continue
+        units = [Unit(u, u.trial) for u in wanted]
+        protocol = Protocol("recovery", 0, wanted[0].driver, seed, None)
+        run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
+        engine = open_engine(run, units, make_host, places)
+        engine.run(units)
         if engine.unrun:
             (name, _), reason = next(iter(engine.unrun.items()))
             raise ScenarioError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.film import Film
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import PlatformPart
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.progress import ProgressLine
 from lerobot_roborecover.trials.sizes import usable_cores
 from lerobot_roborecover.workers.dispatch import failed
@@ -47,25 +47,36 @@ class Count:
 def roll_out(
     options: CollectOptions, env: Any, spec: PlatformPart, units: Sequence[Planned], book: RolloutBook
 ) -> None:
-    """Runs what the book does not hold yet."""
-    passes = [list(units)]
-    if options.judging.scene_touched_mm:
-        passes.append([replace(u, twin=True) for u in units])
-    todo = [
-        [u for u in wanted if book.find(u.record_name, retry_errors=options.retry_errors) is None]
-        for wanted in passes
-    ]
-    total, left = sum(map(len, passes)), sum(map(len, todo))
+    """Runs what the book does not hold yet; the undisturbed twins last, of those that failed: what succeeded
+    is dropped whatever its twin did."""
+    wants_twins = bool(options.judging.scene_touched_mm)
+
+    def lacking(wanted: Iterable[Planned]) -> list[Planned]:
+        return [u for u in wanted if book.find(u.record_name, retry_errors=options.retry_errors) is None]
+
+    def twins() -> list[Planned]:
+        return [replace(u, twin=True) for u in units if wants_twins and not _solved(book, u)]
+
+    def passes() -> Iterator[list[Planned]]:
+        yield lacking(units)
+        yield lacking(twins())
+
+    # Twins of those that are still to be run are counted until they succeed.
+    left, total = len(lacking(units)) + len(lacking(twins())), len(units) + len(twins())
     progress, line = Count(total - left, total), ProgressLine("rollouts", detailed=True, unit="rollouts")
     line.show(progress)
     if not left:
         return
+    disturbed = {u.record_name for u in units}
 
     def on_end(ended: Ended, record: bytes) -> None:
+        solved = ended.outcome == Outcome.SUCCESS
         book.add(ended, record)
         progress.done += 1
         progress.ended += 1
-        progress.solved += ended.outcome == "success"
+        progress.solved += solved
+        if wants_twins and solved and ended.rollout in disturbed:
+            progress.total -= 1
         line.show(progress)
 
     settings = asdict(RecorderSettings(options.seed, options.expert, options.perturbed_steps))
@@ -76,13 +87,18 @@ def roll_out(
     try:
         if options.expert:
             count = _settle(pool, options, draws=draws)
-            for wanted in todo:
+            for wanted in passes():
                 run_expert(wanted, pool, count, on_end)
         else:
-            _run_policy(options, env, todo, pool, draws, on_end)
+            _run_policy(options, env, passes(), pool, draws, on_end)
         line.show(progress, final=True)
     finally:
         pool.release()
+
+
+def _solved(book: RolloutBook, unit: Planned) -> bool:
+    ended = book.find(unit.record_name)
+    return ended is not None and ended.outcome == Outcome.SUCCESS
 
 
 def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
@@ -101,7 +117,7 @@ def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
 def _run_policy(
     options: CollectOptions,
     env: Any,
-    todo: Sequence[Sequence[Planned]],
+    passes: Iterable[Sequence[Planned]],
     pool: SlotPool,
     draws: bool,
     on_end: OnEnd,
@@ -118,7 +134,7 @@ def _run_policy(
         )
     spec = load.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
     places = EnginePlaces(options.workplace, options.slots, options.replicas, str(config.device), draws)
-    run_policy(todo, pool, partial(load.load_host, spec), places, options.seed, on_end)
+    run_policy(passes, pool, partial(load.load_host, spec), places, options.seed, on_end)
 
 
 def film_and_write(
