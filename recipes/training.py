@@ -25,6 +25,8 @@ class Training:
     episodes: list[int] | None = None
     """Of the dataset; None: all."""
     device: str = "cpu"
+    options: tuple[str, ...] = ()
+    """More of `lerobot-train`, e.g. `--seed=1`."""
 
     def arguments(self) -> list[str]:
         """Of `lerobot-train`: from the start, or from the last checkpoint."""
@@ -38,6 +40,7 @@ class Training:
             f"--output_dir={self.folder}",
             *([] if self.device == "cpu" else [f"--policy.device={self.device}"]),
             *([] if wanted is None else [f"--dataset.episodes={json.dumps(wanted, separators=(',', ':'))}"]),
+            *self.options,
         ]
 
     def run(self, result: Path) -> None:

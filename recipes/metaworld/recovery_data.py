@@ -1,0 +1,236 @@
+"""Does training on recoveries help? The same policy, trained for as long on as many frames, a part of which
+are recoveries.
+
+    python -m recipes.metaworld.recovery_data --out outputs/recovery_data
+
+Demonstrations of the study's tasks, clean and shaken; recoveries of the study's policies from the training
+scenarios (`roborecover export-training --of successes`); mixtures of equal size; the study's `act` on each of
+them with several seeds; every result from the test scenarios' recovery points and initial states. What is
+finished is skipped. At the end, tables with intervals over runs and scenarios
+(`roborecover report METHOD=LOG,LOG,...`) and the curve of the recovery rate against the share of recoveries.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.platforms.metaworld import PLATFORM
+from lerobot_roborecover.whole import new_folder
+from recipes.metaworld.dataset import STUDY_TASKS, Episode, create_dataset, save_episode
+from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_demonstrations
+from recipes.training import Training
+
+STUDY = Path("lerobot_roborecover/data/metaworld_study")
+POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}
+"""Policies whose recoveries are learned from, and their trials of each training scenario."""
+SEEDS = (0, 1, 2, 3)
+"""Of training: four runs are the fewest of which a verdict on methods is given (docs/report.md)."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """What a policy is trained on."""
+
+    recoveries: float
+    """Share of its frames."""
+    shaken: bool = False
+    """Whether its demonstrations are shaken ones."""
+
+
+MIXTURES = {
+    "clean": Mixture(0.0),
+    "recoveries_10": Mixture(0.1),
+    "recoveries_25": Mixture(0.25),
+    "recoveries_50": Mixture(0.5),
+    "shaken": Mixture(0.0, shaken=True),
+}
+
+
+def program(*words: str | Path) -> None:
+    """Runs a module of this environment.
+
+    Raises:
+        subprocess.CalledProcessError: it failed; its own output says why.
+    """
+    subprocess.run([sys.executable, "-m", *map(str, words)], check=True)
+
+
+def evaluate(policy: Path, split: str, out: Path, trials: int, start: str = "recovery") -> Path:
+    """Trials of a policy on a split, with what was executed; finished ones are kept.
+
+    Returns:
+        The trial log.
+    """
+    log = out / "trials.jsonl"
+    program(
+        "lerobot_roborecover.cli.main", "eval", "--env", "roborecover_metaworld",
+        f"--env.scenarios={STUDY / 'scenarios'}", f"--env.split={split}", "--env.obs_type=state",
+        f"--env.start={start}", "--env.record_actions=true", f"--env.trial_log={log}",
+        f"--policy.path={policy}", "--policy.device=cpu", f"--eval.n_episodes={trials}",
+        f"--output_dir={out / 'eval'}",
+    )  # fmt: skip
+    return log
+
+
+def make_recoveries(out: Path, pool: dict[str, int]) -> Path:
+    """Successful trials from the training scenarios, as a LeRobotDataset."""
+    root = out / "recoveries"
+    if not root.exists():
+        logs = [
+            evaluate(STUDY / "policies" / name, "train", out / "pool" / name, trials)
+            for name, trials in pool.items()
+        ]
+        program(
+            "lerobot_roborecover.cli.main", "export-training", *logs, "--scenarios", STUDY / "scenarios",
+            "--split", "train", "--env", "obs_type=state", "--of", "successes", "--out", root,
+        )  # fmt: skip
+    return root
+
+
+def read_episodes(root: Path) -> list[tuple[str, Episode]]:
+    """Every episode of a dataset of numbers, with its task's instruction."""
+    import pandas as pd
+    import pyarrow.parquet as pq
+
+    tasks = pd.read_parquet(root / "meta" / "tasks.parquet")
+    by_index = {int(row["task_index"]): str(name) for name, row in tasks.iterrows()}
+    found: dict[int, list[Any]] = {}
+    for path in sorted((root / "data").rglob("*.parquet")):
+        table = pq.read_table(path)
+        solved = "next.success" if "next.success" in table.column_names else "next.reward"
+        columns = [
+            np.array(table[name].to_pylist(), float)
+            for name in ("observation.environment_state", "action", solved)
+        ]
+        episodes, names = (np.array(table[n].to_pylist()) for n in ("episode_index", "task_index"))
+        for episode in np.unique(episodes):
+            rows = episodes == episode
+            task = by_index[int(names[rows][0])]
+            observations, actions, done = (c[rows] for c in columns)
+            found[int(episode)] = [task, Episode(observations, actions, done.reshape(len(done)) > 0)]
+    return [(task, episode) for _, (task, episode) in sorted(found.items())]
+
+
+def draw(
+    episodes: Sequence[tuple[str, Episode]], frames: int, seed: int = 0
+) -> Iterator[tuple[str, Episode]]:
+    """Episodes of exactly so many frames in all: drawn task by task in turn, the last one cut.
+
+    Raises:
+        ValueError: there are not as many.
+    """
+    rng = np.random.default_rng(seed)
+    by_task: dict[str, list[Episode]] = {}
+    for i in rng.permutation(len(episodes)):
+        task, episode = episodes[i]
+        by_task.setdefault(task, []).append(episode)
+    names = sorted(by_task)
+    while frames:
+        if not any(by_task.values()):
+            raise ValueError(f"{frames} frames are lacking")
+        for name in names:
+            if frames and by_task[name]:
+                episode = by_task[name].pop()
+                kept = Episode(*(part[:frames] for part in episode))
+                frames -= len(kept.actions)
+                yield name, kept
+
+
+def frames_of(episodes: Iterable[tuple[str, Episode]]) -> int:
+    """How many there are."""
+    return sum(len(episode.actions) for _, episode in episodes)
+
+
+def mixtures(
+    clean: Sequence[tuple[str, Episode]],
+    shaken: Sequence[tuple[str, Episode]],
+    recoveries: Sequence[tuple[str, Episode]],
+    wanted: dict[str, Mixture],
+) -> dict[str, list[tuple[str, Episode]]]:
+    """Episodes by mixture, of as many frames each as every one of them can have."""
+    total = min(frames_of(clean), frames_of(shaken))
+    share = max((m.recoveries for m in wanted.values()), default=0.0)
+    if share:
+        total = min(total, int(frames_of(recoveries) / share))
+    made = {}
+    for name, mixture in wanted.items():
+        part = round(mixture.recoveries * total)
+        demonstrations = shaken if mixture.shaken else clean
+        made[name] = [*draw(demonstrations, total - part), *draw(recoveries, part)]
+    return made
+
+
+def make_mixtures(out: Path, wanted: dict[str, Mixture], pool: dict[str, int]) -> None:
+    """Writes `out/mixtures/NAME`."""
+    missing = {n: m for n, m in wanted.items() if not (out / "mixtures" / n).exists()}
+    if not missing:
+        return
+    make_demonstrations(out)
+    demonstrations = read_episodes(out / "demonstrations")
+    recoveries = read_episodes(make_recoveries(out, pool))
+    # Every second demonstration of a task is clean (recipes/metaworld/dataset.py).
+    parts = [
+        [d for i, d in enumerate(demonstrations) if (i % EPISODES_PER_TASK) % 2 == odd] for odd in (0, 1)
+    ]
+    tasks = {PLATFORM.task(name).instruction: PLATFORM.task(name) for name in STUDY_TASKS}
+    for name, episodes in mixtures(*parts, recoveries, wanted).items():
+        if name not in missing:
+            continue
+        with new_folder(out / "mixtures" / name) as folder:
+            dataset = create_dataset(folder)
+            for task, episode in episodes:
+                save_episode(dataset, tasks[task], episode)
+            dataset.finalize()
+        print(f"{name}: {len(episodes)} episodes, {frames_of(episodes)} frames", flush=True)
+
+
+def train(out: Path, name: str, seed: int, options: Sequence[str] = ()) -> Path:
+    """One policy; its checkpoint."""
+    result = out / "policies" / f"{name}_{seed}"
+    if not result.exists():
+        Training(
+            CONFIGS / "act.yaml", out / "mixtures" / name, out / "train" / result.name,
+            options=(f"--seed={seed}", *options),
+        ).run(result)  # fmt: skip
+    return result
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--out", type=Path, required=True, help="folder to work in")
+    add("--only", nargs="+", choices=MIXTURES, default=list(MIXTURES), metavar="MIXTURE")
+    add("--seeds", nargs="+", type=int, default=list(SEEDS))
+    add("--train-option", nargs="+", default=[], metavar="OPTION", help="of lerobot-train, without dashes")
+    args = parser.parse_args()
+    if not CONFIGS.is_dir():
+        parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
+    args.out.mkdir(parents=True, exist_ok=True)
+    make_mixtures(args.out, MIXTURES, POOL)
+    logs: dict[str, list[str]] = {}
+    for seed in args.seeds:  # all mixtures with one seed before the next one: what there is can be compared
+        for name in args.only:
+            policy = train(args.out, name, seed, [f"--{o}" for o in args.train_option])
+            folder = args.out / "results" / policy.name
+            for start in ("recovery", "initial"):
+                log = evaluate(policy, "test", folder, 1, start)
+            logs.setdefault(name, []).append(str(log))
+    program(
+        "lerobot_roborecover.cli.main", "report", *(f"{n}={','.join(of)}" for n, of in logs.items()),
+        "--out", args.out / "report",
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
