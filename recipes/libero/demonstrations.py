@@ -6,7 +6,12 @@ clean; in the others the arm is shaken for a while, while the recorded action st
 policy trained on them has seen states beside the expert's path.
 
     python -m recipes.libero.demonstrations --out DIR --workers 2
+    python -m recipes.libero.demonstrations --out RECOVERIES --after policies/libero/act_clean
     python -m recipes.libero.demonstrations --out DIR64 --parts DIR.parts --pictures 64 --suites libero_object
+
+With `--after`, policies drive first, every second one shaken, and the expert takes over at a step that is
+drawn, if the task is not solved by then: the episode begins there, and shows how to go on from where policies
+get.
 
 Each task's episodes are kept in `DIR.parts` once they are whole; a second call goes on from there. Pictures
 are drawn while the same episodes are replayed.
@@ -27,6 +32,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.platforms.base import Driver
 from lerobot_roborecover.platforms.libero.expert import LiberoExpert
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
@@ -35,9 +41,12 @@ from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.platforms.starts import RELEASE_SEED
 from lerobot_roborecover.scenario import Pose, Reset, Task
 from lerobot_roborecover.whole import new_folder
+from recipes.learned import LearnedPolicy
 
-FIRST_SEED = 20_000
-"""Seeds of demonstrations start here."""
+FIRST_SEED, FIRST_SEED_AFTER = 20_000, 40_000
+"""Seeds of demonstrations, and of those after a policy, start here."""
+_TAKEN_OVER = (20, 0.6)
+"""Step at which the expert takes over, at the earliest; and at the latest, of the task's horizon."""
 _STEPS_AFTER_SUCCESS = 3
 _GIVE_UP_AFTER = 3
 """Rollouts for each episode that is wanted."""
@@ -56,6 +65,8 @@ class Wanted:
     pictures: int
     """Side, pixels; 0 for none."""
     part: Path
+    after: tuple[str, ...] = ()
+    """Checkpoints that drive first, in turn."""
 
     @property
     def drawn(self) -> Path:
@@ -115,20 +126,32 @@ def place_again(simulator: LiberoSimulator, task: Task, placed: Mapping[str, np.
 
 
 def demonstration(
-    simulator: LiberoSimulator, task: Task, seed: int, shaken: bool
+    simulator: LiberoSimulator, task: Task, seed: int, shaken: bool, after: Driver | None = None
 ) -> dict[str, np.ndarray] | None:
-    """One successful episode of T steps, as arrays by LeRobot's names; None where the expert failed.
+    """One successful episode of T steps, as arrays by LeRobot's names; None where the expert failed, or had
+    nothing left to do.
 
     Args:
         simulator: with `obs_type="state"`.
         task: what to demonstrate.
         seed: of the placement and of the shaking.
         shaken: disturb the executed actions for 20 to 100 steps from a step that is drawn.
+        after: drives before the episode begins, and is then what is shaken.
     """
     rng = np.random.default_rng(seed)
     placed = place_freshly(simulator, task, seed)
     first = int(rng.integers(0, 60))
     last = first + int(rng.integers(20, 100)) if shaken else first
+    lead = []
+    if after is not None:
+        for t in range(int(rng.integers(_TAKEN_OVER[0], int(_TAKEN_OVER[1] * task.horizon)))):
+            action = after(t)
+            lead.append(perturb_translations(action, rng) if first <= t < last else action)
+            simulator.step(lead[-1])
+            if simulator.succeeded():
+                return None
+        last = first
+    placed["lead"] = np.array(lead).reshape(-1, 7)
     expert, seen, actions, executed, solved = LiberoExpert(LiberoScene(simulator)), [], [], [], []
     for t in range(task.horizon):
         seen.append(simulator.observe())
@@ -166,10 +189,15 @@ def make_part(wanted: Wanted) -> str:
     """One task's episodes, in one file; says how it went."""
     began = time.monotonic()
     simulator = LiberoSimulator(obs_type="state")
+    drivers = [LearnedPolicy(simulator, wanted.task, checkpoint) for checkpoint in wanted.after]
+    first_seed = FIRST_SEED_AFTER if drivers else FIRST_SEED
     episodes, tried = [], 0
     while len(episodes) < wanted.episodes and tried < _GIVE_UP_AFTER * wanted.episodes:
+        after = drivers[tried % len(drivers)] if drivers else None
+        if after is not None:
+            after.reset()
         try:
-            episode = demonstration(simulator, wanted.task, FIRST_SEED + tried, len(episodes) % 2 == 1)
+            episode = demonstration(simulator, wanted.task, first_seed + tried, len(episodes) % 2 == 1, after)
         except SimulatorError:
             episode = None
         tried += 1
@@ -178,11 +206,14 @@ def make_part(wanted: Wanted) -> str:
     simulator.close()
     wanted.part.parent.mkdir(parents=True, exist_ok=True)
     unfinished = wanted.part.with_suffix(".unfinished.npz")
-    names = set(episodes[0] if episodes else ()) - {"start", "fixtures"}
+    names = set(episodes[0] if episodes else ()) - {"start", "fixtures", "lead"}
+    leads = [e["lead"] for e in episodes]
     np.savez(
         unfinished,
         lengths=np.array([len(e["action"]) for e in episodes], dtype=np.int64),
         tried=np.array(tried),
+        leads=np.array([len(lead) for lead in leads], dtype=np.int64),
+        lead=np.concatenate([np.zeros((0, 7)), *leads]),
         **{name: np.array([e[name] for e in episodes]) for name in ("start", "fixtures")},
         **{name: np.concatenate([e[name] for e in episodes]) for name in names},
     )
@@ -203,9 +234,13 @@ def draw_part(wanted: Wanted) -> str:
     pictures: dict[str, list[np.ndarray]] = {camera: [] for camera in CAMERAS}
     with np.load(wanted.part) as part:
         first = 0
+        leads = part["leads"] if "leads" in part.files else np.zeros(len(part["lengths"]), np.int64)
+        led = np.cumsum([0, *leads])
         for k, length in enumerate(part["lengths"]):
             placed = {name: part[name][k] for name in ("start", "fixtures")}
             place_again(simulator, wanted.task, placed)
+            for action in part["lead"][led[k] : led[k + 1]] if leads[k] else ():
+                simulator.step(action)
             for action in part["executed"][first : first + length]:
                 seen = simulator.observe()["pixels"]
                 for camera in CAMERAS:
@@ -288,6 +323,10 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=0, help="side of the two cameras' pictures; 0: none")
     parser.add_argument("--parts", type=Path, help="folder of the finished tasks (OUT.parts)")
     parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument(
+        "--after", nargs="+", default=[], metavar="CHECKPOINT",
+        help="policies that read the state, which drive first, in turn; the expert takes over",
+    )  # fmt: skip
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"--out={args.out} exists already")
@@ -295,7 +334,9 @@ def main() -> None:
     if not tasks:
         parser.error(f"--suites {args.suites}: there are {sorted({t.suite for t in PLATFORM.tasks()})}")
     folder = args.parts or args.out.with_name(f"{args.out.name}.parts")
-    wanted = [Wanted(t, args.episodes_per_task, args.pictures, part_of(folder, t)) for t in tasks]
+    wanted = [
+        Wanted(t, args.episodes_per_task, args.pictures, part_of(folder, t), tuple(args.after)) for t in tasks
+    ]
     _in_processes(make_part, [w for w in wanted if not w.part.exists()], args.workers)
     solved = [w for w in wanted if len(np.load(w.part)["lengths"])]
     if args.pictures:

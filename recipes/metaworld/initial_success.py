@@ -15,8 +15,8 @@ from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.catalog import HORIZON
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
 from lerobot_roborecover.scenario import Reset
+from recipes.learned import LearnedPolicy
 from recipes.metaworld.dataset import STUDY_TASKS
-from recipes.metaworld.learned import LearnedPolicy
 
 FIRST_SEED = 5_000
 """Below the demonstrations' seeds, above the scenarios'."""

@@ -34,9 +34,9 @@ from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
 from lerobot_roborecover.platforms.walk import advance
 from lerobot_roborecover.replay import with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Source
+from recipes.learned import LearnedPolicy
 from recipes.metaworld.dataset import DEMO_TASKS
 from recipes.metaworld.labels import recovery_point, watch
-from recipes.metaworld.learned import LearnedPolicy
 from recipes.metaworld.review import DROPPED
 
 ROLLOUT_STEPS = 400

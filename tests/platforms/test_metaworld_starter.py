@@ -91,7 +91,7 @@ def test_a_recorded_proof_still_recovers(shipped):
 def test_the_policy_loads_as_lerobot_eval_loads_it_and_solves_a_clean_start():
     from lerobot_roborecover.platforms.metaworld import PLATFORM
     from lerobot_roborecover.scenario import Reset
-    from recipes.metaworld.learned import LearnedPolicy
+    from recipes.learned import LearnedPolicy
 
     steps = json.loads((POLICY / "policy_preprocessor.json").read_text())["steps"]
     assert {"device_processor", "rename_observations_processor"} <= {step["registry_name"] for step in steps}

@@ -80,17 +80,19 @@ def test_a_policy_of_the_clone_solves_starts(name, tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.render
-def test_an_episode_is_drawn_by_replaying_it(tmp_path):
+@pytest.mark.parametrize("after", [(), (str(SHIPPED / "act_few"),)], ids=["expert", "after a policy"])
+def test_an_episode_is_drawn_by_replaying_it(after, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from recipes.libero import demonstrations as made
 
     task = made.tasks_of(["libero_goal"])[7]  # the knob: short
-    wanted = made.Wanted(task, 2, 32, made.part_of(tmp_path / "parts", task))
+    wanted = made.Wanted(task, 2, 32, made.part_of(tmp_path / "parts", task), after)
     assert "2 episodes" in made.make_part(wanted)
     with np.load(wanted.part) as part:
         states, lengths = part["observation.environment_state"], part["lengths"]
         assert not np.array_equal(part["start"][0], part["start"][1])
+        assert (part["leads"] > 0).tolist() == [bool(after)] * 2
     made.draw_part(wanted)  # raises where the replay does not end in success
     pictures = LeRobotDataset("a/b", root=wanted.drawn)
     assert len(pictures) == lengths.sum() == len(states)

@@ -1,10 +1,14 @@
-"""A learned policy that drives a Meta-World simulator directly, as the starter set's weak driver."""
+"""A learned policy that drives a simulator directly: as a starter set's weak driver, or until an expert takes
+over."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
-from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
+from lerobot_roborecover.platforms import Simulator, platform_named
 from lerobot_roborecover.scenario import Task
 
 
@@ -17,7 +21,7 @@ class LearnedPolicy:
         checkpoint: folder or Hub id.
     """
 
-    def __init__(self, simulator: MetaworldSimulator, task: Task, checkpoint: str):
+    def __init__(self, simulator: Simulator, task: Task, checkpoint: str):
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -29,6 +33,7 @@ class LearnedPolicy:
             config, checkpoint, preprocessor_overrides=overrides
         )
         self._simulator, self._task = simulator, task
+        self._platform = platform_named(task.platform)
         self.reset()
 
     def reset(self) -> None:
@@ -40,7 +45,11 @@ class LearnedPolicy:
         import torch
         from lerobot.envs.utils import preprocess_observation
 
-        batched = {key: value[None] for key, value in self._simulator.observe().items()}
+        seen = self._platform.process_observation(preprocess_observation(_batched(self._simulator.observe())))
         with torch.inference_mode():
-            observation = self._before({**preprocess_observation(batched), "task": [self._task.instruction]})
+            observation = self._before({**seen, "task": [self._task.instruction]})
             return self._after(self._policy.select_action(observation))[0].numpy().astype(np.float64)
+
+
+def _batched(observation: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: _batched(v) if isinstance(v, Mapping) else v[None] for k, v in observation.items()}
