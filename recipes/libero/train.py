@@ -15,11 +15,12 @@ import argparse
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from recipes.libero.demonstrations import part_of, tasks_of
+from recipes.libero.demonstrations import part_of, tasks_of, write_dataset
 from recipes.training import Training
 
 EPISODES_PER_TASK = 16
@@ -32,11 +33,15 @@ POLICIES: dict[str, slice] = {
     "diffusion": slice(None),
     "tdmpc": slice(None),
     "act_pixels": slice(None),
+    "act_recover": slice(None),
 }
 """Which of each task's demonstrations a policy learns from, by its name."""
 WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
 """Suites of the policies that see pictures."""
 _SIDE = 64
+WITH_RECOVERIES = {"act_recover": ("act_clean", "act_few")}
+"""After whom the expert takes over, in episodes that a policy also learns from."""
+RECOVERIES_PER_TASK = 12
 
 
 def episodes(name: str, parts: Path) -> list[int] | None:
@@ -58,7 +63,8 @@ def episodes(name: str, parts: Path) -> list[int] | None:
 
 def training(name: str, out: Path, device: str = "cpu") -> Training:
     """A policy's training, in `out/train`."""
-    dataset = out / ("pictures" if name in WITH_EYES else "demonstrations")
+    kind = "pictures" if name in WITH_EYES else "demonstrations"
+    dataset = out / ("with_recoveries" if name in WITH_RECOVERIES else kind)
     wanted = episodes(name, out / "demonstrations.parts")
     return Training(CONFIGS / f"{name}.yaml", dataset, out / "train" / name, wanted, device)
 
@@ -80,6 +86,34 @@ def make_demonstrations(out: Path, workers: int) -> None:
             subprocess.run([*program, *given, f"--out={out / name}", *more], check=True)
 
 
+def make_recoveries(out: Path, after: Sequence[str], workers: int) -> None:
+    """Writes `out/recoveries`, and with the demonstrations `out/with_recoveries`.
+
+    Args:
+        out: folder to work in.
+        after: names of policies of the clone (`policies/libero`).
+        workers: processes.
+
+    Raises:
+        subprocess.CalledProcessError: one failed; its own output says why.
+    """
+    if (out / "with_recoveries").exists():
+        return
+    if not (out / "recoveries").exists():
+        program = [sys.executable, "-m", "recipes.libero.demonstrations", f"--workers={workers}"]
+        given = [f"--episodes-per-task={RECOVERIES_PER_TASK}", f"--out={out / 'recoveries'}"]
+        subprocess.run(
+            [*program, *given, "--after", *(f"policies/libero/{name}" for name in after)], check=True
+        )
+    parts = [
+        (task, part)
+        for folder in ("demonstrations.parts", "recoveries.parts")
+        for task in tasks_of(None)
+        if len(np.load(part := part_of(out / folder, task))["lengths"])
+    ]
+    write_dataset(out / "with_recoveries", parts)
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -96,6 +130,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     make_demonstrations(args.out, args.workers)
     for name in args.only:
+        if name in WITH_RECOVERIES and not args.print:
+            make_recoveries(args.out, WITH_RECOVERIES[name], args.workers)
         wanted, result = training(name, args.out, args.device), args.out / "policies" / name
         if args.print:
             print(shlex.join(["lerobot-train", *wanted.arguments()]))
