@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.line_process import LineProcess
 from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
@@ -85,7 +86,8 @@ def record(
     turns: Iterable[Turn],
     one: Callable[[Client, int, Deviation, np.random.Generator], str],
 ) -> Counter[str]:
-    """Records every way into a cell, as far as it can be done.
+    """Records every way into a cell, as far as it can be done. A second call goes on where the first was
+    stopped: what each attempt came to is in `DATASET.turns.jsonl`.
 
     Args:
         config: of the server, which is started here and writes the dataset at the end.
@@ -96,19 +98,23 @@ def record(
         Recordings by way.
     """
     made: Counter[str] = Counter()
-    with _server(config) as address, Client(address) as client:
+    attempts = config.dataset.with_name(f"{config.dataset.name}.turns.jsonl")
+    with Journal(attempts, 1) as journal, _server(config) as address, Client(address) as client:
+        ended = {row["attempt"]: row["recording"] for row in journal.records}
         for turn in turns:
             for number in turn.starts:
                 label = f"{turn.task} {turn.way} {_place(config, number)}"
-                rng = np.random.default_rng([number, sum(map(ord, turn.way))])
-                try:
-                    name = one(client, number, DEVIATIONS[turn.way], rng)
-                except (Fumbled, TeleopRefusal) as err:
-                    print(f"{label}: {err}", flush=True)
-                    continue
-                made[turn.way] += 1
-                print(f"{label}: {name}", flush=True)
-                break
+                if label not in ended:
+                    rng = np.random.default_rng([number, sum(map(ord, turn.way))])
+                    try:
+                        ended[label] = why = one(client, number, DEVIATIONS[turn.way], rng)
+                    except (Fumbled, TeleopRefusal) as err:
+                        ended[label], why = "", str(err)
+                    journal.append({"attempt": label, "recording": ended[label]})
+                    print(f"{label}: {why}", flush=True)
+                if ended[label]:
+                    made[turn.way] += 1
+                    break
     return made
 
 

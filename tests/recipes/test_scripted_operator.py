@@ -88,3 +88,39 @@ def test_a_deviation_is_what_the_rules_call_it(task, way):
     assert (found.stage, found.deviation) == (how.stage, how.deviation)
     # The hand is slow before it stands still.
     assert began - 25 <= found.step <= began + 25
+
+
+def test_a_stopped_operator_goes_on(tmp_path, monkeypatch):
+    from contextlib import nullcontext
+    from types import SimpleNamespace
+
+    import recipes.scripted_operator as operator
+    from recipes.deviations import Fumbled
+    from recipes.scripted_operator import Turn, record
+
+    monkeypatch.setattr(operator, "_server", lambda config: nullcontext("http://"))
+    monkeypatch.setattr(operator, "Client", lambda address: nullcontext(None))
+    starts = [SimpleNamespace(reset=SimpleNamespace(seed=n, init_state_index=n)) for n in range(6)]
+    config = SimpleNamespace(dataset=tmp_path / "set", starts=starts)
+    turns = [Turn("suite/task", "dropped", (0, 1)), Turn("suite/task", "beside", (2, 3)),
+             Turn("suite/task", "astray", (4, 5))]  # fmt: skip
+    asked: list[int] = []
+
+    def one(stop_at: int | None):
+        def attempt(client, number, how, rng) -> str:
+            if number == stop_at:
+                raise KeyboardInterrupt
+            asked.append(number)
+            if number in (0, 4, 5):
+                raise Fumbled("not from there")
+            return f"recording-{number}"
+
+        return attempt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(config, turns, one(stop_at=2))
+    assert asked == [0, 1]
+    assert record(config, turns, one(None)) == {"dropped": 1, "beside": 1}
+    assert asked == [0, 1, 2, 4, 5], "nothing is driven twice"
+    assert record(config, turns, one(None)) == {"dropped": 1, "beside": 1}
+    assert len(asked) == 5
