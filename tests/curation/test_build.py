@@ -69,7 +69,7 @@ WHOLE = {**FAKE, "out": "x", "screen": {**FAKE["screen"], "policies": [{"path": 
     ("key", "value", "words"),
     [
         ("colect", {}, "unknown key colect; did you mean collect?"),
-        ("screen.trails", 5, "unknown key screen.trails; did you mean trials?"),
+        ("screen.trails", 5, "unknown key screen.trails; did you mean trials"),
         ("collect.biased.perturbed", True, "unknown key collect.biased.perturbed; did you mean perturb"),
         ("publish.repo", "a/b", "unknown key publish.repo; did you mean repo_id"),
         ("out", None, "out is missing"),

@@ -102,7 +102,12 @@ def test_numbers_page_and_strips(measured):
     page = (measured / "detectors.html").read_text()
     assert "When they fire" in page
     assert page.count("<figure>") == 4 + 2
-    assert {p.stem for p in (measured / "tables").glob("*.csv")} == {"detectors", "alarms", "inputs"}
+    tables = {p.stem for p in (measured / "tables").glob("*.csv")}
+    assert tables == {"detectors", "pairs", "alarms", "inputs"}
+    pairs = {(p["a"], p["b"]): p for p in numbers["pairs"]}
+    assert len(pairs) == 15, "all pairs of six; the oracle is in none"
+    assert pairs["constant", "knn"]["verdict"] == "B is better"
+    assert pairs["constant", "knn"]["family"] == 15
     scores = np.load(measured / "scores" / "knn.npz")
     assert scores["length"].sum() == len(scores["score"])
     # The oracle knows what nobody knows in use.

@@ -43,6 +43,8 @@ JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
 _PACE = ("engine", "ray_address", "replicas", "slots", "workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
+_ADDED = {"curtail"}
+"""Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 
 class Waiting(Exception):
@@ -331,7 +333,8 @@ def _options(part: Any) -> Any:
     """What of a part decides a result; checkpoints by their content."""
     from lerobot_roborecover.env.identity import policy_identity
 
-    found = {k: v for k, v in asdict(part).items() if k not in _PACE}
+    given = asdict(part).items()
+    found = {k: v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
     if found.get("policy"):
         found["policy"] = policy_identity(found["policy"])
     for policy in found.get("policies", ()):
