@@ -25,7 +25,6 @@ from lerobot_roborecover.analysis.detection_figures import (
     finite,
     strip_figure,
 )
-from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
@@ -115,16 +114,13 @@ def _alarm_row(name: str, alarms: Alarms) -> tuple[Cell, ...]:
     )  # fmt: skip
 
 
-def pairs_of(measured: Sequence[MeasuredDetector], against: Sequence[str], level: float) -> list[Contrast]:
-    """Differences of pairs; the oracle, which reads outcomes, is in none."""
-    reports = {m.name: m.report for m in measured if m.what.split(",")[0] != "oracle"}
-    return detector_contrasts(reports, against=against, level=level)
+def pair_table(found: Sequence[Contrast], level: float) -> Table:
+    """Which of two detectors ranks better, adjusted.
 
-
-def pair_table(found: Sequence[Contrast], against: Sequence[str], level: float) -> Table | None:
-    """Which of two detectors ranks better, adjusted; None without a pair."""
-    if not found:
-        return None
+    Args:
+        found: one pair at least.
+        level: confidence level of the intervals.
+    """
     columns = (
         Column("A"), Column("B"), Column("AUROC, A − B", "points"), Column("p", "p"), Column("p (Holm)", "p"),
         Column("Verdict"),
@@ -132,9 +128,7 @@ def pair_table(found: Sequence[Contrast], against: Sequence[str], level: float) 
     rows = tuple((c.a, c.b, c.difference, c.p, c.p_holm, c.verdict.value) for c in found)
     notes = (
         f"AUROC of needs help, paired over {found[0].units} scenarios by the jackknife; intervals are not "
-        f"adjusted, p (Holm) is, for {found[0].family} pairs"
-        + (f" with {' or '.join(against)}" if against else "")
-        + f". Verdict: p (Holm) below {1 - level:.3g}.",
+        f"adjusted, p (Holm) is, for these {found[0].family} pairs. Verdict: p (Holm) below {1 - level:.3g}.",
     )
     return Table("pairs", "Which ranks better", columns, rows, notes)
 
@@ -156,7 +150,7 @@ def write_detection_report(
     level: float,
     seed: int,
     about: Mapping[str, Any],
-    against: Sequence[str] = (),
+    pairs: Sequence[Contrast] = (),
 ) -> Path:
     """Writes everything.
 
@@ -169,15 +163,12 @@ def write_detection_report(
         level: confidence level of the intervals.
         seed: of the halves of the scenarios.
         about: what was measured: policy, scenarios, command, versions.
-        against: detectors of which one is in every tested pair; empty for all pairs.
+        pairs: of detectors, tested.
 
     Returns:
         The page.
     """
-    found = pairs_of(measured, against, level)
-    pairs = pair_table(found, against, level)
-    tables = [ranking_table(measured, level), *([pairs] if pairs else []), alarm_table(measured, alpha)]
-    tables.append(input_table(measured))
+    tables = [*_results(measured, pairs, alpha, level), input_table(measured)]
     (out / "tables").mkdir(parents=True, exist_ok=True)
     for table in tables:
         (out / "tables" / f"{table.name}.csv").write_text(to_csv(table), encoding="utf-8")
@@ -197,7 +188,7 @@ def write_detection_report(
         "alpha": alpha,
         "level": level,
         "detectors": {m.name: detector_json(m) for m in measured},
-        "pairs": [_pair_json(c) for c in found],
+        "pairs": [_pair_json(c) for c in pairs],
     }
     (out / "detectors.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
     page = render_page(
@@ -209,12 +200,18 @@ def write_detection_report(
 
 
 def detection_text(
-    measured: Sequence[MeasuredDetector], alpha: float, level: float, against: Sequence[str] = ()
+    measured: Sequence[MeasuredDetector], pairs: Sequence[Contrast], alpha: float, level: float
 ) -> str:
     """The tables for a terminal."""
-    pairs = pair_table(pairs_of(measured, against, level), against, level)
-    tables = (ranking_table(measured, level), *([pairs] if pairs else []), alarm_table(measured, alpha))
+    tables = _results(measured, pairs, alpha, level)
     return "\n\n".join(to_text(replace(t, notes=())) for t in tables)
+
+
+def _results(
+    measured: Sequence[MeasuredDetector], pairs: Sequence[Contrast], alpha: float, level: float
+) -> list[Table]:
+    tested = [pair_table(pairs, level)] if pairs else []
+    return [ranking_table(measured, level), *tested, alarm_table(measured, alpha)]
 
 
 def detector_json(m: MeasuredDetector) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from lerobot_roborecover.analysis.contrasts import Contrast, adjusted
-from lerobot_roborecover.analysis.detection import NEEDS_HELP, DetectionReport, Ranking
+from lerobot_roborecover.analysis.detection import NEEDS_HELP, DetectionReport
 from lerobot_roborecover.analysis.intervals import (
     LEVEL,
     difference_interval,
@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis.intervals import (
     estimate_of,
     jackknife,
 )
+from lerobot_roborecover.analysis.monitor_curves import Curve
 from lerobot_roborecover.analysis.permutation import differing
 
 
@@ -27,18 +28,16 @@ def detector_contrasts(
     reports: Mapping[str, DetectionReport],
     *,
     against: Sequence[str] = (),
-    label: str = NEEDS_HELP,
     level: float = LEVEL,
 ) -> list[Contrast]:
-    """Differences of AUROC, one family; detectors that have none are left out.
+    """Differences of AUROC for `NEEDS_HELP`, one family; detectors that have none are left out.
 
     Args:
         reports: by name, of the same trials in the same order.
         against: names; only pairs with one of them are asked about. Empty: all pairs.
-        label: of frames.
         level: confidence level.
     """
-    curves = {name: r.rankings[label] for name, r in reports.items() if label in r.rankings}
+    curves = {n: r.rankings[NEEDS_HELP].roc for n, r in reports.items() if NEEDS_HELP in r.rankings}
     pairs = [
         (a, b) if b in against or not against else (b, a)
         for a, b in combinations(curves, 2)
@@ -47,14 +46,12 @@ def detector_contrasts(
     return adjusted([_contrast(a, curves[a], b, curves[b], level) for a, b in pairs])
 
 
-def _contrast(a: str, first: Ranking, b: str, second: Ranking, level: float) -> Contrast:
-    x, y = first.roc, second.roc
+def _contrast(a: str, x: Curve, b: str, y: Curve, level: float) -> Contrast:
     value = x.area.value - y.area.value
     weights = np.maximum(x.weights, y.weights)
     left_out = x.left_out - y.left_out
     found = jackknife(value, left_out, weights)
     count = int(found.units)
-    moves = weights > 0
     return Contrast(
         a,
         b,
@@ -63,7 +60,7 @@ def _contrast(a: str, first: Ranking, b: str, second: Ranking, level: float) -> 
         float("nan"),
         count,
         count,
-        differing(left_out[moves] - value),
+        differing(left_out[weights > 0] - value),
         0,
         True,
         level,

@@ -149,9 +149,9 @@ def _side_by_side(args: argparse.Namespace) -> int:
     }
     page = write_detection_report(
         args.out, found.measured, found.scored, strips, alpha=args.alpha, level=args.level, seed=args.seed,
-        about=about, against=args.against,
+        about=about, pairs=found.pairs,
     )  # fmt: skip
-    print(detection_text(found.measured, args.alpha, args.level, args.against))
+    print(detection_text(found.measured, found.pairs, args.alpha, args.level))
     for remark in remarks:
         print(f"\nnote: {remark}", file=sys.stderr)
     for m in found.measured:

@@ -150,7 +150,7 @@ def demonstration(
             simulator.step(lead[-1])
             if simulator.succeeded():
                 return None
-        last = first
+        last = first  # the expert itself is not shaken
     placed["lead"] = np.array(lead).reshape(-1, 7)
     expert, seen, actions, executed, solved = LiberoExpert(LiberoScene(simulator)), [], [], [], []
     for t in range(task.horizon):
@@ -234,14 +234,14 @@ def draw_part(wanted: Wanted) -> str:
     pictures: dict[str, list[np.ndarray]] = {camera: [] for camera in CAMERAS}
     with np.load(wanted.part) as part:
         first = 0
-        leads = part["leads"] if "leads" in part.files else np.zeros(len(part["lengths"]), np.int64)
-        led = np.cumsum([0, *leads])
+        # Parts of before `--after` have no lead.
+        lead = np.split(part["lead"], np.cumsum(part["leads"])[:-1]) if "lead" in part.files else None
+        placed, executed = {name: part[name] for name in ("start", "fixtures")}, part["executed"]
         for k, length in enumerate(part["lengths"]):
-            placed = {name: part[name][k] for name in ("start", "fixtures")}
-            place_again(simulator, wanted.task, placed)
-            for action in part["lead"][led[k] : led[k + 1]] if leads[k] else ():
+            place_again(simulator, wanted.task, {name: rows[k] for name, rows in placed.items()})
+            for action in () if lead is None else lead[k]:
                 simulator.step(action)
-            for action in part["executed"][first : first + length]:
+            for action in executed[first : first + length]:
                 seen = simulator.observe()["pixels"]
                 for camera in CAMERAS:
                     pictures[camera].append(seen[camera][::-1, ::-1])  # as LeRobot's processor turns them

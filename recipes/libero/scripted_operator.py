@@ -181,8 +181,8 @@ def record(
                 state = init_states[(k + i) % len(init_states)]
                 starts.append(first_state("libero", task.name, task.suite, init_state=state))
     config = TeleopConfig(
-        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size,
-        film_every=FILM_EVERY if size else 1, options={"render_quality": "fast"},
+        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
+        options={"render_quality": "fast"},
     )  # fmt: skip
     simulator = LiberoSimulator(obs_type="state")
 

@@ -187,7 +187,9 @@ def main() -> None:
     parser.add_argument("--seeds", default="500-502", help="tried in turn until one succeeds (%(default)s)")
     parser.add_argument("--ways", nargs="+", choices=DEVIATIONS, default=list(DEVIATIONS), metavar="WAY")
     parser.add_argument("--horizon", type=int, default=200, help="budget of the tasks (%(default)s)")
-    parser.add_argument("--size", type=int, default=64, help="of the pictures (%(default)s)")
+    parser.add_argument(
+        "--size", type=int, default=64, help="of the pictures; 0 for none, numbers alone (%(default)s)"
+    )
     args = parser.parse_args()
     tasks = STUDY_TASKS if args.tasks == ["study"] else args.tasks
     made = record(args.out, tasks, parse_numbers(args.seeds, "--seeds"), args.ways, args.horizon, args.size)

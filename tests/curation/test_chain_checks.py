@@ -128,6 +128,16 @@ def test_weights_that_were_cut_off_are_found(problems, tmp_path):
 
 
 @pytest.mark.lerobot
+def test_a_curtailed_screening_leaves_enough_to_validate_with(problems):
+    screen = {**problems.good["screen"], "curtail": True}
+    found = problems("screen", screen)
+    assert not any("curtail" in line for line in found)
+    problems.good["validate"] = {**problems.good.get("validate", {}), "runs": 4}
+    (line,) = [line for line in problems("screen", screen) if "curtail" in line]
+    assert line.startswith("validate: runs 4: with screen.curtail a scenario may have only 3 trials")
+
+
+@pytest.mark.lerobot
 def test_the_command_runs_nothing_where_something_stands_against_it(problems, tmp_path, capsys):
     path = write(tmp_path / "bad.yaml", changed(problems.good, "split.sizes", {"train": 0.5, "test": 0.6}))
     assert main(["build", str(path)]) == 2

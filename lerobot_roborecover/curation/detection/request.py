@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis.conformal import least_rollouts
+from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
 from lerobot_roborecover.analysis.detection_page import MeasuredDetector
+from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.curation.detection.fitting import check_training_data, fit_features, fit_states
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks, cost_ms, score_trials
@@ -81,6 +83,8 @@ class Detection:
     """By detector."""
     dropped: Counter
     remarks: list[str]
+    pairs: list[Contrast]
+    """Of detectors, but for the oracle, which reads outcomes."""
 
 
 @dataclass
@@ -136,9 +140,10 @@ def compare_detectors(
         raise MonitorError(
             f"two detectors have one name: {[n.name for n in named]}; write --detector NAME=WHAT"
         )
-    unknown = sorted(set(request.against) - {n.name for n in named})
+    tested = [n.name for n in named if not _knows(n.what)]
+    unknown = sorted(set(request.against) - set(tested))
     if unknown:
-        raise MonitorError(f"--against {unknown[0]!r:.80}: there are {', '.join(n.name for n in named)}")
+        raise MonitorError(f"--against {unknown[0]!r:.80}: those that are tested are {', '.join(tested)}")
     links = [ScenarioLink(s.id, s.sha256(), "") for s in scenarios]
     if not request.on_training_scenarios:
         for n in named:
@@ -170,7 +175,14 @@ def compare_detectors(
                 n.name, n.what, _reads(n.detector), n.fitted_to, n.probabilities, report, cost, saved
             )
         )
-    return Detection(measured, trials, scored, dropped, remarks)
+    reports = {m.name: m.report for m in measured if m.name in tested}
+    pairs = detector_contrasts(reports, against=request.against, level=request.level)
+    return Detection(measured, trials, scored, dropped, remarks, pairs)
+
+
+def _knows(what: str) -> bool:
+    """Whether a detector reads outcomes, so that no test can mean anything."""
+    return split_options(what)[0] == "oracle"
 
 
 def _load(text: str, request: DetectionRequest) -> NamedDetector:

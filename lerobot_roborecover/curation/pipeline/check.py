@@ -23,7 +23,7 @@ from lerobot_roborecover.curation.pipeline.config import ChainConfig
 from lerobot_roborecover.curation.pipeline.places import Places
 from lerobot_roborecover.curation.pipeline.requests import assignments
 from lerobot_roborecover.curation.render import check_size
-from lerobot_roborecover.curation.screen.screening import ScreenRule
+from lerobot_roborecover.curation.screen.screening import CURTAILED_LEAST, ScreenRule
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
@@ -83,6 +83,11 @@ def check_build(config: ChainConfig) -> list[str]:
             raise OptionError(f"rejects {rejects} is not there")
         validation = requests.validation_request(config, places)
         validation.workplace.check()
+        if config.screen.curtail and validation.rule.runs > CURTAILED_LEAST:
+            raise OptionError(
+                f"runs {validation.rule.runs}: with screen.curtail a scenario may have only "
+                f"{CURTAILED_LEAST} trials to replay. Set runs to {CURTAILED_LEAST}, or leave curtail out"
+            )
         _check_env(config.platform, validation.env)
     with problems.of("split"):
         requests.split_config(config)

@@ -26,7 +26,7 @@ from lerobot_roborecover.curation.screen.screening import (
     tally,
 )
 from lerobot_roborecover.curation.stage_dataset import write_stage
-from lerobot_roborecover.datasets import load_scenarios, read_scenarios
+from lerobot_roborecover.datasets import ScenarioSet, load_scenarios, read_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import TrialRow
@@ -149,20 +149,20 @@ def screen_dataset(
 
 
 def _trials(
-    request: ScreenRequest, scenarios: Sequence[Scenario], progress: Callable[[str, int, int], None]
+    request: ScreenRequest, scenarios: ScenarioSet, progress: Callable[[str, int, int], None]
 ) -> dict[str, list[TrialRow]]:
     """Every trial that the verdicts need, by the policy's name.
 
     A curtailed screening takes one policy after the other, those that need one trial only first, and as many
     trials of each as may settle some verdict, of the scenarios that are open then.
     """
-    platform, started = load_scenarios(request.dataset).platform, False
+    rule, started = request.rule, False
     rows: dict[str, dict[tuple, TrialRow]] = {p.name: {} for p in request.policies}
 
     def run(policy: PolicySpec, trials: int, only: Collection[str] | None) -> None:
         nonlocal started
         found = run_policy(
-            policy, request.dataset, platform, request.trials, trials=trials, only=only,
+            policy, request.dataset, scenarios.platform, request.trials, trials=trials, only=only,
             run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
             slots=request.slots, max_batch=request.max_batch, replicas=request.replicas,
             workplace=replace(request.workplace, fits=started),
@@ -171,22 +171,24 @@ def _trials(
         started = True
         rows[policy.name] |= {t.row.key(): t.row for t in found}
 
-    def counted_so_far() -> list[Screened]:
-        return tally(scenarios, {n: list(r.values()) for n, r in rows.items()}, rule, request.deterministic)
+    def undecided() -> list[Screened]:
+        so_far = {name: list(of.values()) for name, of in rows.items()}
+        return [s for s in tally(scenarios, so_far, rule, request.deterministic) if not s.settled]
 
-    rule = request.rule
     for policy in sorted(
         request.policies, key=lambda p: rule.curtail and p.name not in request.deterministic
     ):
         most = 1 if policy.name in request.deterministic else rule.trials
         trials = 0
         while trials < most:
-            chosen = [s for s in counted_so_far() if not s.settled] if rule.curtail else None
-            if chosen == []:
+            if not rule.curtail:
+                trials, only = most, None
+            elif left := undecided():
+                trials = min(trials + min(s.soonest for s in left), most)
+                only = {s.scenario.id for s in left}
+            else:
                 break
-            soonest = min((s.soonest for s in chosen), default=most) if chosen else most
-            trials = min(trials + soonest, most)
-            run(policy, trials, None if chosen is None else [s.scenario.id for s in chosen])
+            run(policy, trials, only)
     return {name: list(of.values()) for name, of in rows.items()}
 
 

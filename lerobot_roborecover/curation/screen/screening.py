@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.env.trial_log import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
 KEEP = ("0.1", "0.9")
 """Shares of all trials (paper: a recovery rate between 10 % and 90 %); 2 to 18 of 20."""
-CURTAILED_LEAST = 3
+CURTAILED_LEAST = ValidationRule.runs
 """Trials that every scenario gets, however early its verdict is settled: as many as `validate` replays."""
 _BAR = 40
 

@@ -103,7 +103,9 @@ def write_dataset(
         return True
     if missing:
         seen = {**options, **view_options(platform, size)}
-        simulator, film = make_simulator(platform, **seen), Film(film_every, seen)
+        simulator = make_simulator(platform, **seen)
+        # Numbers cost nothing, and none may stand for another step's.
+        film = Film(1 if size == 0 else film_every, seen)
         try:
             done = len(paths) - sum(len(group) for group, _ in missing)
             for group, part in missing:
