@@ -16,12 +16,14 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.studio.line_process import LineProcess
 from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.studio.teleop.serve import TeleopConfig, serve
+from lerobot_roborecover.studio.teleop.write import recordings_folder
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 
 OPERATOR = "scripted-operator"
 FILM_EVERY = 16
 """Steps from one picture of the dataset to the next: software rendering is slow."""
 START_S = 300.0
+ATTEMPTS_FILE = "attempts.jsonl"
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def record(
     one: Callable[[Client, int, Deviation, np.random.Generator], str],
 ) -> Counter[str]:
     """Records every way into a cell, as far as it can be done. A second call goes on where the first was
-    stopped: what each attempt came to is in `DATASET.turns.jsonl`.
+    stopped: what each attempt came to is kept beside the recordings, and goes with them.
 
     Args:
         config: of the server, which is started here and writes the dataset at the end.
@@ -98,7 +100,7 @@ def record(
         Recordings by way.
     """
     made: Counter[str] = Counter()
-    attempts = config.dataset.with_name(f"{config.dataset.name}.turns.jsonl")
+    attempts = recordings_folder(config.dataset) / ATTEMPTS_FILE
     with Journal(attempts, 1) as journal, _server(config) as address, Client(address) as client:
         ended = {row["attempt"]: row["recording"] for row in journal.records}
         for turn in turns:

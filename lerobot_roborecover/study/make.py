@@ -71,7 +71,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
                 name,
                 (_program(words, out / name),),
                 (out / name / "meta" / "roborecover" / "candidates.json",),
-                (out / name, out / f"{name}.recordings"),
+                (out / name,),
             )
             for name, words in recipe.recordings.items()
         ),
