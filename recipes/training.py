@@ -52,7 +52,7 @@ class Training:
         arguments = self.arguments()
         if "--resume=true" not in arguments:  # LeRobot refuses the folder of a run without a checkpoint
             shutil.rmtree(self.folder, ignore_errors=True)
-        program = [sys.executable, "-m", "recipes.metaworld.frames_in_memory"]
+        program = [sys.executable, "-m", "recipes.frames_in_memory"]
         subprocess.run([*program, *arguments], check=True)
         with new_folder(result) as policy:
             shutil.copytree(

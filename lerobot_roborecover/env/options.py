@@ -21,7 +21,8 @@ class RecoveryOptions:
     """Options of `--env.type=roborecover_*`, beside LeRobot's own of the platform."""
 
     scenarios: str = ""
-    """Hub dataset id, folder, or the name of a shipped set; empty takes the platform's shipped set."""
+    """Hub dataset id, folder, or the name of a shipped set; empty takes the platform's shipped set, and of
+    it, where no split is named, what is for tests."""
     revision: str | None = None
     """Commit, tag or branch of a Hub dataset. Pin one: results name it."""
     split: str | None = None

@@ -246,12 +246,8 @@ def _real_time(options: RecoveryOptions, facts: RunFacts) -> RealTime | None:
 
 
 def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:
-    return load_scenarios(
-        options.scenarios or _default_scenarios(platform),
-        revision=options.revision,
-        split=options.split,
-        select=options.select,
-    )
+    scenarios, split = platform_named(platform).evaluated(options.scenarios, options.split)
+    return load_scenarios(scenarios, revision=options.revision, split=split, select=options.select)
 
 
 def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str) -> ScenarioSet:
@@ -265,15 +261,6 @@ def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str
             f"Use at most {len(scenarios)}"
         )
     return replace(part, scenarios=tuple(map(_without_pictures, part)))
-
-
-def _default_scenarios(platform: str) -> str:
-    found = platform_named(platform).default_scenarios
-    if not found:
-        raise OptionError(
-            f"--env.scenarios: {platform} has no shipped scenarios; name a folder or a dataset of the Hub"
-        )
-    return found
 
 
 def _without_pictures(scenario: Scenario) -> Scenario:

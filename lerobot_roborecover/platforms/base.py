@@ -117,6 +117,8 @@ class Platform:
     """`module:Class` of the simulator, imported where one is made."""
     default_scenarios: ClassVar[str] = ""
     """Scenario set that the env type takes where none is named: a shipped set, Hub id or folder."""
+    default_split: ClassVar[str] = ""
+    """The split of the default set that is evaluated where neither a set nor a split is named; empty: all."""
     experts: ClassVar[Mapping[str, Expert]] = {}
     """Scripted drivers by name."""
     perturbable: ClassVar[bool] = True
@@ -319,6 +321,20 @@ class Platform:
                 f"Install it with: {self.install_command}"
             ) from err
         return cls(**options)
+
+    def evaluated(self, scenarios: str, split: str | None) -> tuple[str, str | None]:
+        """The set and the split that are meant: as given, or the default set, of which the default split.
+
+        Raises:
+            OptionError: none is given, and there is no default.
+        """
+        if scenarios:
+            return scenarios, split
+        if not self.default_scenarios:
+            raise OptionError(
+                f"--env.scenarios: {self.name} has no shipped scenarios; name a folder or a Hub dataset"
+            )
+        return self.default_scenarios, split or self.default_split or None
 
     @property
     def install_command(self) -> str:

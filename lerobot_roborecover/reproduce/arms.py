@@ -99,14 +99,15 @@ class ReproductionPlan:
         """
         found = {name: self.option(f"env.{name}") or "" for name in _SET}
         kind = (self.option("env.type") or "").removeprefix(ENV_PREFIX)
-        source = found["scenarios"] or (platform_named(kind).default_scenarios if kind else "")
+        source, split = found["scenarios"], found["split"] or None
+        own = platform_named(kind) if kind else None
+        if own and own.default_scenarios:
+            source, split = own.evaluated(source, split)
         if not source:
             raise OptionError(
                 f"{self.checkpoint.config}: no scenario set. Give one: --scenarios FOLDER_OR_HUB_ID"
             )
-        return load_scenarios(
-            source, revision=found["revision"] or None, split=found["split"] or None, select=found["select"]
-        )
+        return load_scenarios(source, revision=found["revision"] or None, split=split, select=found["select"])
 
     def length(self, start: str, scenarios: ScenarioSet) -> RunLength:
         """What an arm should take at most."""

@@ -34,7 +34,7 @@ class StudyRecipe:
     """or the module, with arguments, that trains them."""
     recordings: dict[str, list[str]] = field(default_factory=dict)
     """Module and arguments of scripted operators, by the chain's folder for what they record."""
-    train: str = "recipes.metaworld.frames_in_memory"
+    train: str = "recipes.frames_in_memory"
     """`lerobot-train`, fed from memory: the same weights, sooner."""
     correction: str = "policies/train/correction_act.yaml"
     monitor: str = "policies/train/monitor_small.yaml"

@@ -34,12 +34,13 @@ POLICIES: dict[str, slice] = {
     "tdmpc": slice(None),
     "act_pixels": slice(None),
     "act_recover": slice(None),
+    "act_recover_large": slice(None),
 }
 """Which of each task's demonstrations a policy learns from, by its name."""
 WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
 """Suites of the policies that see pictures."""
 _SIDE = 64
-WITH_RECOVERIES = {"act_recover": ("act_clean", "act_few")}
+WITH_RECOVERIES = {name: ("act_clean", "act_few") for name in ("act_recover", "act_recover_large")}
 """After whom the expert takes over, in episodes that a policy also learns from."""
 RECOVERIES_PER_TASK = 12
 

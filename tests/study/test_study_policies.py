@@ -38,7 +38,7 @@ def test_batches_from_memory_are_the_dataset_s(demonstrations, episodes, monkeyp
     from lerobot.datasets.dataset_reader import DatasetReader
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from recipes.metaworld.frames_in_memory import frames_in_memory
+    from recipes.frames_in_memory import frames_in_memory
 
     deltas = {"action": [i / 80 for i in range(12)], "observation.state": [-1 / 80, 0.0]}
     dataset = LeRobotDataset("a/b", root=demonstrations, episodes=episodes, delta_timestamps=deltas)
@@ -61,7 +61,7 @@ def test_pictures_from_memory_are_the_dataset_s(tmp_path):
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from recipes.metaworld.frames_in_memory import frames_in_memory
+    from recipes.frames_in_memory import frames_in_memory
 
     features = {
         "observation.images.image": {
@@ -91,7 +91,7 @@ def test_training_from_memory_is_training(name, demonstrations, tmp_path, monkey
     from lerobot.scripts.lerobot_train import main as lerobot_train
     from safetensors.numpy import load_file
 
-    from recipes.metaworld.frames_in_memory import main as from_memory
+    from recipes.frames_in_memory import main as from_memory
 
     weights = []
     for index, run in enumerate((lerobot_train, from_memory)):

@@ -5,7 +5,7 @@ action chunks: half a second for a batch of 128, many times what a small policy 
 dataset of numbers, and of pictures of 64 x 64 that are kept as images, fits into memory as a few tensors.
 `lerobot-train` sees the same frames in the same order either way (a test compares them), only sooner:
 
-    python -m recipes.metaworld.frames_in_memory --config_path=... (as lerobot-train)
+    python -m recipes.frames_in_memory --config_path=... (as lerobot-train)
 """
 
 from __future__ import annotations
