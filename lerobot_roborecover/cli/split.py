@@ -26,8 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=42, help="of the draw (%(default)s)")
     add(
         "--apart", metavar="KEYS",
-        help="what no two splits may share, of trajectory, record, instruction, separated by commas "
+        help="what no two splits may share, of trajectory, record, instruction, start, separated by commas "
         "(trajectory,record; on robotwin also instruction)",
+    )  # fmt: skip
+    add(
+        "--least", action="append", default=[], metavar="SPLIT:KEY=N",
+        help="scenarios of each cell, source or suite that a split has at least, e.g. test:cell=12, where "
+        "the set has as many; repeat it for several",
     )  # fmt: skip
     add(
         "--out", type=Path, metavar="FOLDER", help="write a copy there; without it the dataset itself changes"
@@ -63,12 +68,12 @@ def run(args: argparse.Namespace) -> int:
 
 def config(args: argparse.Namespace) -> SplitConfig:
     """How to divide, from parsed arguments."""
-    from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_sizes
+    from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_least, parse_sizes
 
     apart = parse_apart(args.apart)
     named = {"train": args.train, "val": args.val, "test": args.test}
     sizes = parse_sizes({**{k: v for k, v in named.items() if v}, **dict(_pair(o) for o in args.others)})
-    return SplitConfig(sizes, args.seed, apart)
+    return SplitConfig(sizes, args.seed, apart, parse_least(args.least))
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -19,8 +19,8 @@ good programmes is taken.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,7 +35,9 @@ _AXES = {
     "cell, source and suite": lambda s: f"{s.cell} / {s.source.value} / {s.task.suite}",
 }
 """What splits are balanced over. The last one counts less: it decides among what the others leave open."""
+_JOINT = "cell, source and suite"
 _JOINT_WEIGHT = 0.25
+_FITTING_ROUNDS = 50
 _NODES = 200
 """Branch-and-bound nodes: a limit that gives the same result on every machine, unlike one of time."""
 
@@ -50,6 +52,9 @@ class SplitConfig:
     seed: int = 42
     apart: tuple[str, ...] | None = None
     """What no two splits may share, of `APART`; None takes what fits the platform."""
+    least: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """By split and by `cell`, `source` or `suite`: how many scenarios of each at least, where the set has as
+    many. The rest is balanced as ever."""
 
 
 def parse_sizes(given: Mapping[str, str]) -> dict[str, int | float]:
@@ -102,6 +107,39 @@ def parse_apart(text: str | None) -> tuple[str, ...] | None:
     if unknown or not keys:
         raise ScenarioError(f"--apart {text!r:.80}: {unknown[:1] or 'nothing'} is not of {', '.join(APART)}")
     return keys
+
+
+def parse_least(given: Iterable[str]) -> dict[str, dict[str, int]]:
+    """Least numbers as they are written on a command line, e.g. `test:cell=12`.
+
+    Raises:
+        ScenarioError: one is not written so.
+    """
+    least: dict[str, dict[str, int]] = defaultdict(dict)
+    for text in given:
+        split, _, rest = text.partition(":")
+        axis, _, number = rest.partition("=")
+        if not number.strip().isdecimal():
+            raise ScenarioError(f"--least {text!r:.60} is not written SPLIT:KEY=NUMBER, e.g. test:cell=12")
+        least[split.strip()][axis.strip()] = int(number)
+    return dict(least)
+
+
+def check_least(least: Mapping[str, Mapping[str, int]], sizes: Collection[str]) -> None:
+    """Checks that least numbers are of splits and keys that there are.
+
+    Raises:
+        ScenarioError: they are not.
+    """
+    keys = [axis for axis in _AXES if axis != _JOINT]
+    for split, numbers in least.items():
+        if split not in sizes:
+            raise ScenarioError(f"least: no split is called {split!r:.40}; there are {', '.join(sizes)}")
+        for axis, number in numbers.items():
+            if axis not in keys or number < 0:
+                raise ScenarioError(
+                    f"least of {split}: {axis!r:.40}: {number}; write a number for one of {', '.join(keys)}"
+                )
 
 
 def apart_for(scenarios: Sequence[Scenario], apart: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -192,23 +230,22 @@ def assign(scenarios: Sequence[Scenario], config: SplitConfig) -> dict[str, str]
 
     Raises:
         ScenarioError: the counts do not add up, or groups make them impossible; the nearest that are
-            possible are named.
+            possible are named. Or the least numbers cannot be met.
     """
+    check_least(config.least, config.sizes)
     names = sorted(config.sizes)
     counts = _counts(len(scenarios), config.sizes)
     groups = groups_of(scenarios, apart_for(scenarios, config.apart))
     rng = np.random.default_rng(config.seed)
     kinds: dict[tuple, list[list[int]]] = defaultdict(list)
     for members in groups:
-        kinds[
-            tuple(sorted(Counter(_AXES["cell, source and suite"](scenarios[i]) for i in members).items()))
-        ].append(members)
+        kinds[tuple(sorted(Counter(_AXES[_JOINT](scenarios[i]) for i in members).items()))].append(members)
     ordered = sorted(kinds.items())
     # The solver takes the first of several equally good solutions: the order makes it the seed's.
     ordered = [ordered[i] for i in rng.permutation(len(ordered))]
     wanted = np.array([counts[name] for name in names], dtype=float)
     exact = all(isinstance(v, int) for v in config.sizes.values())
-    table = _solve(scenarios, [members for _, members in ordered], wanted, exact, names)
+    table = _solve(scenarios, [members for _, members in ordered], wanted, exact, names, config.least)
     result: dict[str, str] = {}
     for (_, members), row in zip(ordered, table, strict=True):
         targets = [name for name, number in zip(names, row, strict=True) for _ in range(number)]
@@ -241,6 +278,7 @@ def _solve(
     wanted: np.ndarray,
     exact: bool,
     names: Sequence[str],
+    least: Mapping[str, Mapping[str, int]],
 ) -> np.ndarray:
     """(kinds, splits) int: how many groups of each kind go to each split."""
     available = np.array([len(groups) for groups in kinds])
@@ -259,15 +297,55 @@ def _solve(
                 f"together, and the largest groups have {', '.join(map(str, largest))}. The nearest is {near}"
             )
         wanted = reached.astype(float)
-    features, weights = [], []
+    features, weights, expected, floors = [], [], [], []
     for axis, key in _AXES.items():
         values = sorted({key(s) for s in scenarios})
         members = [Counter(key(scenarios[i]) for i in groups[0]) for groups in kinds]
-        features += [[m[value] for m in members] for value in values]
-        weights += [_JOINT_WEIGHT if axis == "cell, source and suite" else 1.0] * len(values)
-    matrix = np.array(features, dtype=float).T
-    expected = (available @ matrix)[:, None] * wanted[None, :] / max(wanted.sum(), 1.0)
-    return _programme(available, matrix, expected, np.array(weights), sizes=sizes, exactly=wanted)
+        rows = np.array([[m[value] for m in members] for value in values], dtype=float)
+        weights += [_JOINT_WEIGHT if axis == _JOINT else 1.0] * len(values)
+        there = rows @ available
+        floor = np.tile([float(least.get(name, {}).get(axis, 0)) for name in names], (len(values), 1))
+        floor[there < floor.sum(axis=1)] = 0.0
+        features.append(rows)
+        floors.append(floor)
+        expected.append(_expected(there, wanted, floor))
+    matrix, floor = np.concatenate(features).T, np.concatenate(floors)
+    try:
+        return _programme(
+            available,
+            matrix,
+            np.concatenate(expected),
+            np.array(weights),
+            sizes=sizes,
+            exactly=wanted,
+            floor=floor,
+        )
+    except ScenarioError as err:
+        if not floor.any():
+            raise
+        raise ScenarioError(f"with least numbers {dict(least)}: {err}. Or ask for less") from err
+
+
+def _expected(there: np.ndarray, wanted: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """(F, S) scenarios of each value of an axis that each split should have.
+
+    Shares of the splits' sizes. Where floors are above them, the rest is fitted to what is left of each value
+    and each split (iterative proportional fitting).
+
+    Args:
+        there: (F,) scenarios of each value.
+        wanted: (S,) sizes of the splits.
+        floor: (F, S) that each must have at least.
+    """
+    shares = there[:, None] * wanted[None, :] / max(wanted.sum(), 1.0)
+    if (shares >= floor).all():
+        return shares
+    above = np.maximum(shares - floor, 1e-6)
+    for _ in range(_FITTING_ROUNDS):
+        above *= (np.maximum(wanted - floor.sum(axis=0), 0.0) / above.sum(axis=0))[None, :]
+        above *= (np.maximum(there - floor.sum(axis=1), 0.0) / np.maximum(above.sum(axis=1), 1e-9))[:, None]
+        above = np.maximum(above, 1e-9)
+    return floor + above
 
 
 def _programme(
@@ -278,6 +356,7 @@ def _programme(
     *,
     sizes: np.ndarray | None = None,
     exactly: np.ndarray | None = None,
+    floor: np.ndarray | None = None,
 ) -> np.ndarray:
     """Distributes groups so that features lie as near to what is expected as can be.
 
@@ -290,6 +369,7 @@ def _programme(
         weights: (F,) of the distances.
         sizes: (K,) scenarios in a group of a kind.
         exactly: (S,) scenarios that each split must have; needs `sizes`.
+        floor: (F, S) scenarios with each feature that each split must have at least.
 
     Returns:
         (K, S) int.
@@ -312,6 +392,10 @@ def _programme(
         rows.append([kron(sizes[None, :], eye_array(splits)), None])
         low.append(exactly)
         high.append(exactly)
+    if floor is not None and floor.any():
+        rows.append([per_feature, None])
+        low.append(floor.ravel())
+        high.append(np.full(count * splits, np.inf))
     cost = np.concatenate([np.zeros(kinds * splits), np.repeat(weights, splits)])
     found = milp(
         cost,

@@ -182,6 +182,7 @@ def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[
         "sizes": dict(config.sizes),
         "seed": config.seed,
         "kept_apart": list(report.apart),
+        **({"least": {split: dict(of) for split, of in config.least.items()}} if config.least else {}),
         "counts": dict(report.counts),
         "groups": report.groups,
     }

@@ -40,7 +40,7 @@ POLICIES: dict[str, slice] = {
 WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
 """Suites of the policies that see pictures."""
 _SIDE = 64
-WITH_RECOVERIES = {name: ("act_clean", "act_few") for name in ("act_recover", "act_recover_large")}
+WITH_RECOVERIES = dict.fromkeys(("act_recover", "act_recover_large"), ("act_clean", "act_few"))
 """After whom the expert takes over, in episodes that a policy also learns from."""
 RECOVERIES_PER_TASK = 12
 

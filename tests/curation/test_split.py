@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,14 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.cli import split as command
 from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
-from lerobot_roborecover.curation.split import SplitConfig, assign, groups_of, parse_apart, parse_sizes
+from lerobot_roborecover.curation.split import (
+    SplitConfig,
+    assign,
+    groups_of,
+    parse_apart,
+    parse_least,
+    parse_sizes,
+)
 from lerobot_roborecover.curation.split_dataset import (
     check_splits,
     format_report,
@@ -96,6 +104,58 @@ def test_counts_are_met_exactly_or_refused_with_the_nearest(scenarios, wanted, s
         named = int(str(refusal.value).partition("The nearest is --test ")[2].partition(",")[0])
         assert named in reachable
         assert abs(named - wanted) == nearest
+
+
+@settings(max_examples=20, deadline=None)
+@given(grouped_sets(), st.integers(1, 4), st.integers(0, 3))
+def test_a_split_has_at_least_so_many_of_each_or_refuses(scenarios, number, seed):
+    least = {"test": {"cell": number}}
+    sizes = {"train": 0.7, "test": 0.3}
+    there = Counter(s.cell for s in scenarios)
+    alone = len(groups_of(scenarios, ("trajectory", "record"))) == len(scenarios)
+    room = Counter(assign(scenarios, SplitConfig(sizes, seed)).values())["test"]
+    needed = sum(number for n in there.values() if n >= number)
+    splits = {}
+    with suppress(ScenarioError):
+        splits = assign(scenarios, SplitConfig(sizes, seed, least=least))
+    # Refused for too little room, or for a group that holds what is scarce and more.
+    assert splits or not alone or room < needed
+    if not splits:
+        return
+    tests = Counter(s.cell for s in scenarios if splits[s.id] == "test")
+    assert all(tests[cell] >= number for cell, n in there.items() if n >= number)
+    assert not report_splits([replace(s, split=splits[s.id]) for s in scenarios], None).leaks
+
+
+def test_what_is_not_scarce_is_balanced_as_ever():
+    scenarios = [scenario(i, stage=STAGES[2] if i < 6 else STAGES[i % 2]) for i in range(66)]
+    sizes = {"train": 44, "test": 22}
+    splits = assign(scenarios, SplitConfig(sizes, least={"test": {"cell": 5}}))
+    tests = Counter(s.stage for s in scenarios if splits[s.id] == "test")
+    assert tests[STAGES[2]] == 5
+    assert abs(tests[STAGES[0]] - tests[STAGES[1]]) <= 1
+    assert Counter(splits.values()) == sizes
+
+
+def test_more_than_a_split_holds_is_refused():
+    config = SplitConfig({"train": 8, "test": 2}, least={"test": {"cell": 1}})
+    with pytest.raises(ScenarioError, match=r"'cell': 1.* ask for less"):
+        assign([scenario(i, stage=STAGES[i % 3]) for i in range(10)], config)
+
+
+@pytest.mark.parametrize(
+    ("least", "message"),
+    [({"exam": {"cell": 1}}, "no split is called 'exam'"), ({"test": {"colour": 1}}, "'colour': 1; write")],
+)
+def test_least_numbers_of_nothing_are_refused(least, message):
+    with pytest.raises(ScenarioError, match=message):
+        assign([scenario(i) for i in range(4)], SplitConfig({"train": 3, "test": 1}, least=least))
+
+
+@pytest.mark.parametrize("text", ["test", "test:cell", "test:cell=few", "cell=3"])
+def test_least_numbers_are_written_in_one_way(text):
+    with pytest.raises(ScenarioError, match="SPLIT:KEY=NUMBER"):
+        parse_least([text])
 
 
 def test_strata_are_divided_in_proportion():

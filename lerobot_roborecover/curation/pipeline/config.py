@@ -132,6 +132,8 @@ class SplitPart:
     """By split: counts, or fractions."""
     seed: int | None = None
     apart: str | None = None
+    least: dict[str, dict[str, int]] | None = None
+    """By split and by cell, source or suite: how many of each at least."""
 
 
 @dataclass

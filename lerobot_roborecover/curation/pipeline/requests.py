@@ -29,7 +29,7 @@ from lerobot_roborecover.curation.resolution import ResolutionConfig
 from lerobot_roborecover.curation.screen.dataset import ScreenRequest
 from lerobot_roborecover.curation.screen.runs import PolicySpec
 from lerobot_roborecover.curation.screen.screening import ScreenRule
-from lerobot_roborecover.curation.split import SplitConfig, check_sizes, parse_apart
+from lerobot_roborecover.curation.split import SplitConfig, check_least, check_sizes, parse_apart
 from lerobot_roborecover.curation.validate.request import ValidationRequest, read_rejects
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.datasets.publish import PublishConfig
@@ -234,7 +234,10 @@ def split_config(config: ChainConfig) -> SplitConfig:
     part = config.split
     fractions = any(size != int(size) for size in part.sizes.values())
     sizes = {name: float(size) if fractions else int(size) for name, size in part.sizes.items()}
-    return SplitConfig(check_sizes(sizes), given(part.seed, SplitConfig.seed), parse_apart(part.apart))
+    check_least(part.least or {}, sizes)
+    return SplitConfig(
+        check_sizes(sizes), given(part.seed, SplitConfig.seed), parse_apart(part.apart), part.least or {}
+    )
 
 
 def render_request(config: ChainConfig, places: Places) -> RenderRequest:

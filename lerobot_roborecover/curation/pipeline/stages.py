@@ -43,7 +43,7 @@ JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
 _PACE = ("engine", "ray_address", "replicas", "slots", "workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
-_ADDED = {"curtail"}
+_ADDED = {"curtail", "least"}
 """Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 
