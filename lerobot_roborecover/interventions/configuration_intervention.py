@@ -9,6 +9,7 @@ from lerobot.optim.optimizers import OptimizerConfig
 
 from lerobot_roborecover.env.intervention_options import MODES, POLICY_TYPE
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.policies.not_trained import NotTrained
 
 
 @dataclass
@@ -42,7 +43,7 @@ class MonitorConfig:
 
 @PreTrainedConfig.register_subclass(POLICY_TYPE)
 @dataclass
-class RoboRecoverInterventionConfig(PreTrainedConfig):
+class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
     """A base policy, and what may step in for it (paper, "Benchmark-Guided Recovery Interventions")."""
 
     base: MemberConfig = field(default_factory=MemberConfig)
@@ -95,30 +96,12 @@ class RoboRecoverInterventionConfig(PreTrainedConfig):
         """Whether a monitor decides when to intervene."""
         return self.mode.startswith("monitor") or (self.mode == "human" and bool(self.monitor.path))
 
-    @property
-    def observation_delta_indices(self) -> None:
-        """Members keep histories of their own."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        """It is not trained."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """It is not trained."""
-        return None
-
     def get_optimizer_preset(self) -> OptimizerConfig:
         """Refuses: its members are trained on their own."""
         raise OptionError(
             "roborecover_intervention is put together, not trained: train its correction policy with "
             "lerobot-train (docs/interventions.md) and name it with --policy.correction.path"
         )
-
-    def get_scheduler_preset(self) -> None:
-        """None: it is not trained."""
 
     def validate_features(self) -> None:
         """Members are checked against the environment when they are loaded."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim.optimizers import OptimizerConfig
 
+from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.remote.errors import RemoteError
 
 SCHEMES = {"openpi": ("ws://", "wss://"), "vla_eval": ("ws://", "wss://"), "gr00t": ("tcp://",)}
@@ -16,7 +17,7 @@ _URL, _GR00T_URL = "ws://127.0.0.1:8000", "tcp://127.0.0.1:5555"
 
 @PreTrainedConfig.register_subclass("remote")
 @dataclass
-class RemoteConfig(PreTrainedConfig):
+class RemoteConfig(NotTrained, PreTrainedConfig):
     """A policy on a server that speaks openpi's protocol, vla-eval's, or GR00T's."""
 
     url: str = _URL
@@ -70,21 +71,6 @@ class RemoteConfig(PreTrainedConfig):
             if value is not None and not low <= value <= high:
                 raise RemoteError(f"--policy.{name}={value}: must be from {low} to {high}")
 
-    @property
-    def observation_delta_indices(self) -> None:
-        """None: nothing is trained."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        """None: nothing is trained."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """None: nothing is trained."""
-        return None
-
     def get_optimizer_preset(self) -> OptimizerConfig:
         """Nothing to optimise.
 
@@ -92,9 +78,6 @@ class RemoteConfig(PreTrainedConfig):
             NotImplementedError: always.
         """
         raise NotImplementedError("a remote policy is not trained here: its weights are on the server")
-
-    def get_scheduler_preset(self) -> None:
-        """None: nothing is trained."""
 
     def validate_features(self) -> None:
         """Nothing: the mapping is checked against the first observation."""
