@@ -1,6 +1,6 @@
 """Copies a trained policy as it ships: half precision, for a CPU, without the training's own settings.
 
-    python -m recipes.ship CHECKPOINT lerobot_roborecover/data/pusht_policies/NAME
+    python -m recipes.ship CHECKPOINT policies/pusht/NAME
 
 LeRobot loads them into float32 again.
 """

@@ -172,7 +172,13 @@ def file_sha256(path: Path) -> str:
 def _write_parquet(file: IO[bytes], scenarios: Sequence[Scenario]) -> None:
     # No dictionaries: with plain values the sizes in a file's metadata bound what reading it takes, and the
     # reader insists on that. zstd compresses repeats as well.
-    options = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
+    # Actions are most of a file: sorted by byte they take a fifth less.
+    options = {
+        "compression": "zstd",
+        "use_dictionary": False,
+        "write_statistics": False,
+        "column_encoding": {"prefix.list.element": "BYTE_STREAM_SPLIT"},
+    }
     schema = pa.schema([*SCHEMA, RESET_OPTIONS]) if any(s.reset.options for s in scenarios) else SCHEMA
     with pq.ParquetWriter(file, schema, **options) as writer:
         for begin in range(0, len(scenarios), _ROWS_PER_GROUP):

@@ -24,7 +24,7 @@ SETS = [
 FEW = [
     pytest.param("metaworld_starter", 4, marks=pytest.mark.metaworld),
     pytest.param("metaworld_study", 3, marks=pytest.mark.metaworld),
-    pytest.param("libero_starter", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
+    pytest.param("libero_recovery", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
     pytest.param("pusht_starter", 4, marks=pytest.mark.slow),
 ]
 """Sets, and how many scenarios the default run takes of each."""
@@ -33,11 +33,15 @@ WHOLE = [
     pytest.param("metaworld_starter", "", marks=pytest.mark.metaworld),
     pytest.param("metaworld_study", "", marks=pytest.mark.metaworld),
     pytest.param("pusht_starter", ""),
-    *(pytest.param("libero_starter", f"suite={s}", marks=pytest.mark.libero) for s in LIBERO_SUITES),
+    *(
+        pytest.param(name, f"suite={s}", marks=pytest.mark.libero)
+        for name in ("libero_starter", "libero_recovery")
+        for s in LIBERO_SUITES
+    ),
 ]
 
 
-STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1}
+STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1, "libero_recovery": 0 if PINNED else 9}
 """Scenarios whose handoff may be refused, with other kernels than those of the recording: measured."""
 
 

@@ -44,7 +44,8 @@ class LiberoPlatform(Platform):
     }
     extra = "libero"
     simulator = "lerobot_roborecover.platforms.libero.simulator:LiberoSimulator"
-    default_scenarios = "libero_starter"
+    default_scenarios = "libero_recovery"
+    default_split = "test"
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
         """By suite, in hf-libero's order."""
