@@ -1,4 +1,4 @@
-"""Copies a trained policy as it ships: half precision, for a CPU, without the training's own settings.
+"""Copies a trained policy as it ships: half precision, for a CPU, without the training's settings and places.
 
     python -m recipes.ship CHECKPOINT policies/pusht/NAME
 
@@ -8,6 +8,7 @@ LeRobot loads them into float32 again.
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 from pathlib import Path
 
@@ -23,6 +24,10 @@ def ship(checkpoint: Path, out: Path) -> None:
             weights = load_file(file)
             half = {k: v.half() if v.dtype == torch.float32 else v for k, v in weights.items()}
             save_file(half, out / file.name, metadata={"format": "pt"})
+        elif file.name == "config.json":
+            # Which folder training went on from is a place of the machine that trained.
+            config = json.loads(file.read_text()) | {"device": "cpu", "pretrained_path": None}
+            (out / file.name).write_text(json.dumps(config, indent=4))
         elif file.suffix == ".json" and file.name != "train_config.json":
             (out / file.name).write_text(file.read_text().replace('"device": "cuda"', '"device": "cpu"'))
         elif file.name != "train_config.json":

@@ -24,6 +24,7 @@ SETS = [
 FEW = [
     pytest.param("metaworld_starter", 4, marks=pytest.mark.metaworld),
     pytest.param("metaworld_study", 3, marks=pytest.mark.metaworld),
+    pytest.param("libero_starter", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
     pytest.param("libero_recovery", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
     pytest.param("pusht_starter", 4, marks=pytest.mark.slow),
 ]
@@ -41,7 +42,7 @@ WHOLE = [
 ]
 
 
-STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1, "libero_recovery": 0 if PINNED else 9}
+STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1}
 """Scenarios whose handoff may be refused, with other kernels than those of the recording: measured."""
 
 
