@@ -45,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--detector", action="append", metavar="[NAME=]WHAT[,OPTION=VALUE...]",
         help="a checkpoint of a monitor, of a saved detector or of a LeRobot reward model; or "
-        "chunk_disagreement, constant, elapsed, no_progress, oracle, policy_features, state_distance; may be "
-        "given again",
+        "chunk_disagreement, constant, elapsed, no_progress, oracle, policy_features, recovery_gain, "
+        "state_distance; may be given again",
     )  # fmt: skip
     add("--scenarios", help="scenario set: folder, Hub id or shipped name")
     add("--policy", metavar="CHECKPOINT", help="who acts in the trials, and is watched")
@@ -63,6 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--training-data", type=Path, metavar="DIR",
         help="LeRobotDataset that the policy was trained on, for state_distance (successful clean rollouts)",
+    )  # fmt: skip
+    add(
+        "--forks", type=Path, metavar="LOG",
+        help="log of `roborecover fork` on trials of the policy, for recovery_gain",
     )  # fmt: skip
     add(
         "--alpha", type=float, default=0.1,
@@ -126,6 +130,7 @@ def _side_by_side(args: argparse.Namespace) -> int:
         fit_split=args.fit_split,
         fit_select=args.fit_select,
         training_data=args.training_data,
+        forks=args.forks,
         alpha=args.alpha,
         on_training_scenarios=args.on_training_scenarios,
         device=args.device,

@@ -13,7 +13,8 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.env.trial_log import read_trial_log
 from tests.support.factories import fake_scenario, save_policy
-from tests.support.played_trials import played_trials
+from tests.support.played_trials import played_trial, played_trials
+from tests.support.trial_rows import write_log
 
 pytestmark = pytest.mark.lerobot
 DETECTORS = (
@@ -148,6 +149,76 @@ def test_one_of_the_two_ways_to_measure_is_asked_for(capsys):
     assert "--data is missing. Give --monitor and --data" in capsys.readouterr().err
     assert main(["eval-monitor", "--detector", "constant"]) == 2
     assert "--scenarios is missing" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def forks(dataset, policy, tmp_path_factory) -> Path:
+    """A log of forks of the training scenarios: at every step the policy would fail, an expert would not; in
+    clean rollouts nothing is gained."""
+    from lerobot_roborecover.curation.forks.arms import ForkArm
+    from lerobot_roborecover.curation.forks.parents import LoggedTrial
+    from lerobot_roborecover.curation.forks.trial import Fork
+    from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
+
+    folder = tmp_path_factory.mktemp("forks")
+    (folder / ACTIONS_FOLDER).mkdir()
+    rows = []
+    for scenario in load_scenarios(dataset, split="train"):
+        for start in ("recovery", "initial"):
+            alone = played_trial(scenario, start, expert=start == "initial")
+            helped = played_trial(scenario, start, expert=True)
+            for step in (0, 4, 8):
+                for arm, trial in (("continue", alone), ("correction", helped)):
+                    parent = LoggedTrial(scenario, alone.row, alone.actions)
+                    note = Fork(parent, step, ForkArm(arm, "" if arm == "continue" else "c")).note()
+                    row = replace(
+                        trial.row, policy=policy_identity(str(policy)), config_hash=f"{arm} {start} {step}",
+                        options={"fork": note.as_json()},
+                    )  # fmt: skip
+                    rows.append(row)
+                    np.save(actions_path(folder / ACTIONS_FOLDER, row), trial.actions)
+    write_log(folder / "trials.jsonl", rows)
+    return folder
+
+
+def test_an_expected_gain_is_learned_from_forks(dataset, policy, forks, tmp_path, played, capsys):
+    """Of what was seen at the forks alone; what is saved never steps in where harm is expected."""
+    gain = ("gain=recovery_gain,steps=300", "elapsed")
+    out = tmp_path / "out"
+    assert main(command(dataset, policy, out, "--forks", str(forks), detectors=gain)) == 0
+    assert played == ["test-recovery", "test-initial"]  # no trials of the training split are asked for
+    found = json.loads((out / "detectors.json").read_text())["detectors"]["gain"]
+    assert found["fitted_to"] == "36 forks of 12 trials: 18 rescued, 0 harmed, 18 alike"
+    assert not found["probabilities"]
+    assert found["own_decisions"] is not None
+    saved = json.loads((out / "detectors" / "gain" / "config.json").read_text())
+    assert saved["threshold"] == pytest.approx(max(0, found["conformal_threshold"]), abs=1e-5)
+    assert (saved["arm"], saved["policy"]) == ("correction:c", "act")
+    used = json.loads((out / "detectors" / "gain" / "monitor_training.json").read_text())["scenarios"]
+    assert set(used) == {s.id for s in load_scenarios(dataset, split="train")}
+    # Saved, it is held out against other scenarios, as a monitor is.
+    on_train = command(dataset, policy, tmp_path / "again", detectors=(f"g={out / 'detectors' / 'gain'}",))
+    assert main([*on_train, "--split", "train"]) == 2
+    assert "6 scenarios are in training and in validation" in capsys.readouterr().err
+
+
+def test_forks_that_teach_nothing_are_refused(dataset, policy, forks, tmp_path, played, capsys):
+    def refused(message, *more, detectors=("recovery_gain",), of=policy):
+        assert main(command(dataset, of, tmp_path / "out", *more, detectors=detectors)) == 2
+        assert message in capsys.readouterr().err
+        assert not played
+
+    with_log = ("--forks", str(forks))
+    refused("recovery_gain learns from forks: give --forks LOG")
+    refused("no detector learns from forks", *with_log, detectors=("elapsed",))
+    refused("no log there; `roborecover fork --out", "--forks", str(tmp_path))
+    refused("no arm begins with 'rollback'", *with_log, detectors=("recovery_gain,arm=rollback",))
+    refused("in training and in validation", *with_log, "--split", "train")
+    refused("Fork its own trials", *with_log, of=save_policy(tmp_path / "other", "diffusion"))
+    rows = read_trial_log(forks / "trials.jsonl")
+    plain = write_log(tmp_path / "plain.jsonl", [replace(row, options={}) for row in rows])
+    refused("the log has no forks", "--forks", str(plain))
 
 
 @pytest.mark.slow

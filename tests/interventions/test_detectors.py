@@ -222,6 +222,31 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
         detector.judge_windows([DetectorWindow([Glimpse({}, None, torch.zeros(3))], "go", 0)])
 
 
+def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
+    """Half rescued and half harmed is no gain, three rescued of four are 0.75; never a threshold below 0."""
+    import torch
+
+    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+
+    places = np.eye(3, dtype=np.float32)
+    gains = {0: [1, -1, 1, -1], 1: [1, 1, 1, 0], 2: [0, 0, -1, 0]}
+    features = torch.from_numpy(np.stack([places[k] for k, v in gains.items() for _ in v] * 20))
+    found = torch.tensor([g for v in gains.values() for g in v] * 20)
+    detector = load("recovery_gain,steps=800,hidden_dim=16,learning_rate=0.02,dropout=0,weight_decay=0")
+    detector.fit(features, found)
+    assert detector.config.labels == {"rescued": 100, "harmed": 60, "alike": 80}
+    asked = [DetectorWindow([Glimpse({}, None, torch.from_numpy(p))], "go", 0) for p in places]
+    said = detector.judge_windows(asked)
+    np.testing.assert_allclose(said.scores, [0.0, 0.75, -0.25], atol=0.05)
+    assert list(said.triggers[1:]) == [True, False]
+    detector.save_pretrained(tmp_path)
+    again = load(str(tmp_path))
+    np.testing.assert_array_equal(again.judge_windows(asked).scores, said.scores)
+    assert (again.config.threshold, again.least_threshold) == (0.0, 0.0)
+    with pytest.raises(MonitorError, match="of 3 forks stepping in rescued none"):
+        load("recovery_gain").fit(features[:3], -torch.ones(3))
+
+
 @pytest.mark.parametrize("kind", ["act", "diffusion"])
 def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
     """A detector beside trials under way, in a batch with another one, against windows made afterwards."""

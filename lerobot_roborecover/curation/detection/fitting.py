@@ -1,7 +1,7 @@
-"""Fits the detectors that learn: the distance from training states, and the network on the policy's features.
+"""Fits the detectors that learn: the distance from training states, and networks on the policy's features.
 
-Both are fitted to trials of the policy that acts, on scenarios that nothing is measured on; the states rather
-to the policy's own training set, where that is given.
+All are fitted to trials of the policy that acts, on scenarios that nothing is measured on; the states rather
+to the policy's own training set, where that is given, and expected gains to forks.
 """
 
 from __future__ import annotations
@@ -13,10 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from lerobot_roborecover.curation.detection.forked import SeenForks
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks
 from lerobot_roborecover.curation.detection.trials import SeenTrial
 from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds
-from lerobot_roborecover.interventions.detectors.modeling_policy import RoboRecoverPolicyFeaturesRewardModel
+from lerobot_roborecover.interventions.detectors.modeling_policy import (
+    RoboRecoverPolicyFeaturesRewardModel,
+    RoboRecoverRecoveryGainRewardModel,
+)
 from lerobot_roborecover.interventions.detectors.modeling_states import (
     RoboRecoverStateDistanceRewardModel,
 )
@@ -132,6 +136,37 @@ def fit_features(
     _remember(detector, used)
     counts: Mapping[str, int] = detector.config.labels
     return f"{counts['1']} steps that need help and {counts['0']} that do not, of {len(used)} trials"
+
+
+def fit_gain(
+    detector: RoboRecoverRecoveryGainRewardModel, forks: Sequence[SeenForks], looks: PolicyLooks
+) -> str:
+    """Fits it to what stepping in gained where trials were forked.
+
+    Args:
+        detector: not fitted yet.
+        forks: of trials of the policy that it watches, on scenarios that nothing is measured on.
+        looks: into that policy.
+
+    Returns:
+        What it was fitted to, in words.
+
+    Raises:
+        MonitorError: stepping in rescued nowhere.
+    """
+    features, gains = [], []
+    for forked in forks:
+        steps = looks.of(forked.trial, DetectorNeeds(internals=True))[-1]
+        for step, gain in forked.gains.items():
+            features.append(steps[step][1])
+            gains.append(gain)
+    detector.fit(torch.stack(features), torch.tensor(gains))
+    _remember(detector, [f.trial for f in forks])
+    counts: Mapping[str, int] = detector.config.labels
+    return (
+        f"{len(gains)} forks of {len(forks)} trials: {counts['rescued']} rescued, {counts['harmed']} harmed, "
+        f"{counts['alike']} alike"
+    )
 
 
 def _remember(detector: Any, trials: Sequence[SeenTrial]) -> None:

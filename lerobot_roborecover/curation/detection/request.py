@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from lerobot_roborecover.analysis.conformal import least_rollouts
 from lerobot_roborecover.analysis.contrasts import Contrast
@@ -15,12 +15,19 @@ from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
 from lerobot_roborecover.analysis.detection_page import MeasuredDetector
 from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.curation.detection.fitting import check_training_data, fit_features, fit_states
+from lerobot_roborecover.curation.detection.fitting import (
+    check_training_data,
+    fit_features,
+    fit_gain,
+    fit_states,
+)
+from lerobot_roborecover.curation.detection.forked import ForkLog, read_forks, see_forks
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks, cost_ms, score_trials
 from lerobot_roborecover.curation.detection.trials import SeenTrial, TrialSource, see_trials
 from lerobot_roborecover.curation.monitor_data.data import check_disjoint
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
+from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.interventions.detectors.base import DetectorRewardModel
 from lerobot_roborecover.interventions.detectors.interface import Detector, MonitorDetector
 from lerobot_roborecover.interventions.detectors.loading import (
@@ -29,7 +36,9 @@ from lerobot_roborecover.interventions.detectors.loading import (
     split_options,
 )
 from lerobot_roborecover.interventions.detectors.modeling_policy import (
+    FeatureNetwork,
     RoboRecoverPolicyFeaturesRewardModel,
+    RoboRecoverRecoveryGainRewardModel,
 )
 from lerobot_roborecover.interventions.detectors.modeling_states import (
     RoboRecoverStateDistanceRewardModel,
@@ -60,6 +69,8 @@ class DetectionRequest:
     """Which of them; None takes those that `source.select` takes."""
     training_data: Path | None = None
     """LeRobotDataset that the policy was trained on, for the distance from training states."""
+    forks: Path | None = None
+    """Log of `roborecover fork` on the policy's trials, for the expected gain."""
     alpha: float = 0.1
     """False-alarm rate of the conformal thresholds, a clean rollout."""
     on_training_scenarios: bool = False
@@ -149,6 +160,7 @@ def compare_detectors(
         for n in named:
             _check_held_out(n, links)
     _check_fitting(named, request)
+    forks = _forks(named, request, links)
     host, features = _host(request, scenarios.platform)
     policy, pre, _ = host.parts
     probe = PolicyProbe(policy, pre)
@@ -156,7 +168,7 @@ def compare_detectors(
         check_needs(f"--detector {n.name}", n.detector.needs, features, probe, TRUTHS)
     looks = PolicyLooks(probe)
     trials, dropped = see_trials(source, request.split, host.env_batch, progress)
-    _fit(named, request, host, looks, links, progress)
+    _fit(named, request, forks, host, looks, links, progress)
     remarks = _remarks(trials, request)
     measured, scored = [], {}
     for n in named:
@@ -221,9 +233,37 @@ def _check_held_out(named: NamedDetector, links: Sequence[ScenarioLink]) -> None
 
 
 def _learns_from_trials(named: NamedDetector, request: DetectionRequest) -> bool:
-    learns = not getattr(named.detector, "fitted", True)
+    learns = not getattr(named.detector, "fitted", True) and not _learns_from_forks(named.detector)
     of_states = isinstance(named.detector, RoboRecoverStateDistanceRewardModel)
     return learns and not (of_states and request.training_data is not None)
+
+
+def _learns_from_forks(detector: Detector) -> TypeGuard[RoboRecoverRecoveryGainRewardModel]:
+    return isinstance(detector, RoboRecoverRecoveryGainRewardModel) and not detector.fitted
+
+
+def _forks(
+    named: Sequence[NamedDetector], request: DetectionRequest, links: Sequence[ScenarioLink]
+) -> dict[str, ForkLog]:
+    """By detector, the forks that it learns from; refused before anything runs."""
+    from lerobot_roborecover.trials.load import policy_config
+
+    learning = {n.name: d for n in named if _learns_from_forks(d := n.detector)}
+    if bool(learning) != (request.forks is not None):
+        raise MonitorError(
+            f"--detector {min(learning)} learns from forks: give --forks LOG, which `roborecover fork` makes "
+            "of the policy's trials on other scenarios"
+            if learning
+            else f"--forks {request.forks}: no detector learns from forks; add --detector recovery_gain"
+        )
+    if request.forks is None:
+        return {}
+    source = request.source
+    policy = facts_of(policy_config(source.policy, (), source.device)).policy
+    found = {name: read_forks(request.forks, policy, d.config.arm) for name, d in learning.items()}
+    for log in found.values():
+        check_disjoint(log.links, links, f"--forks {request.forks}")
+    return found
 
 
 def _check_fitting(named: Sequence[NamedDetector], request: DetectionRequest) -> None:
@@ -241,6 +281,7 @@ def _check_fitting(named: Sequence[NamedDetector], request: DetectionRequest) ->
 def _fit(
     named: Sequence[NamedDetector],
     request: DetectionRequest,
+    forks: Mapping[str, ForkLog],
     host: Any,
     looks: PolicyLooks,
     links: Sequence[ScenarioLink],
@@ -258,6 +299,11 @@ def _fit(
             n.fitted_to = fit_states(n.detector, trials, request.training_data)
         elif isinstance(n.detector, RoboRecoverPolicyFeaturesRewardModel):
             n.fitted_to = fit_features(n.detector, trials, looks)
+        elif isinstance(n.detector, RoboRecoverRecoveryGainRewardModel):
+            seen = see_forks(forks[n.name], request.source, host.env_batch, progress)
+            n.fitted_to = fit_gain(n.detector, seen, looks)
+            n.detector.config.arm = forks[n.name].arm
+        if isinstance(n.detector, FeatureNetwork):
             n.detector.config.policy = looks.probe.kind if looks.probe else ""
         _check_held_out(n, links)
 
@@ -282,7 +328,7 @@ def _save(named: NamedDetector, threshold: float, out: Path) -> str:
         return ""
     folder = out / DETECTORS_FOLDER / named.name
     own = detector.config
-    detector.config = replace(own, threshold=threshold)
+    detector.config = replace(own, threshold=max(threshold, detector.least_threshold))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with new_folder(folder, replace=True) as temporary:

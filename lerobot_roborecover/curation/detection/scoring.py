@@ -42,7 +42,8 @@ class PolicyLooks:
     probe: PolicyProbe | None
 
     def __post_init__(self):
-        self._kept: dict[tuple[int, int, bool], list[Looks]] = {}
+        # With the trial itself: another one may get the id of one that is gone.
+        self._kept: dict[tuple[int, int, bool], tuple[SeenTrial, list[Looks]]] = {}
 
     def of(self, trial: SeenTrial, needs: DetectorNeeds) -> list[Looks]:
         """By segment of the trial, and step of it."""
@@ -50,8 +51,8 @@ class PolicyLooks:
             return [[(None, None)] * (s.stop - s.start) for s in trial.segments]
         key = (id(trial), needs.chunks, needs.internals)
         if key not in self._kept:
-            self._kept[key] = [self._look(trial, s, needs, self.probe) for s in trial.segments]
-        return self._kept[key]
+            self._kept[key] = trial, [self._look(trial, s, needs, self.probe) for s in trial.segments]
+        return self._kept[key][1]
 
     def _look(self, trial: SeenTrial, segment: slice, needs: DetectorNeeds, probe: PolicyProbe) -> Looks:
         steps = observations_of(trial, segment)

@@ -133,11 +133,13 @@ def see_trials(
                 dropped[f"{split}, {start}: {trial.row.outcome}"] += 1
             else:
                 usable.append((by_id[trial.row.scenario_id], trial))
-        found += _seen(usable, scenarios.platform, options, source, env_batch, f"{split}, {start}", progress)
+        found += look_at(
+            usable, scenarios.platform, options, source, env_batch, f"{split}, {start}", progress
+        )
     return found, dropped
 
 
-def _seen(
+def look_at(
     trials: Sequence[tuple[Scenario, PolicyTrial]],
     platform: str,
     options: Mapping[str, Any],
@@ -146,6 +148,17 @@ def _seen(
     what: str,
     progress: Callable[[str, int, int], None],
 ) -> list[SeenTrial]:
+    """Replays trials, of which each step is kept in the working folder.
+
+    Args:
+        trials: with their scenarios.
+        platform: of all of them.
+        options: of the simulator.
+        source: working folder and processes.
+        env_batch: as of `see_trials`.
+        what: they are, in the words of the progress.
+        progress: as of `see_trials`.
+    """
     one = make_simulator(platform, **options)
     control_hz = one.control_hz
     one.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,8 @@ class DetectorRewardModel(PreTrainedRewardModel):
     config: Any
     fitted: bool = True
     """Whether it can be asked: False for one that has to be fitted first, and has not been."""
+    least_threshold: float = -math.inf
+    """Below it no threshold is set, whatever the rate of false alarms that is allowed."""
 
     def __init__(self, config: Any, **_: Any):
         config.check()

@@ -27,11 +27,9 @@ class RoboRecoverChunkDisagreementConfig(DetectorConfig):
                 raise self.refuse(name, "at least 1")
 
 
-@RewardModelConfig.register_subclass("roborecover_policy_features")
 @dataclass
-class RoboRecoverPolicyFeaturesConfig(DetectorConfig):
-    """A small network on what the policy itself computes before its actions (SAFE; Gu et al. 2025,
-    "Multitask Failure Detection for Vision-Language-Action Models"), fitted to whether it recovers."""
+class FeatureNetworkConfig(DetectorConfig):
+    """A small network on what the policy itself computes before its actions."""
 
     hidden_dim: int = 64
     """Width of its hidden layer."""
@@ -46,10 +44,28 @@ class RoboRecoverPolicyFeaturesConfig(DetectorConfig):
     width: int = 0
     """Of the features; filled when it is fitted."""
     labels: dict[str, int] = field(default_factory=dict)
-    """Frames that it was fitted to, by label."""
+    """How many of each label it was fitted to."""
 
     def check(self) -> None:
         """Sizes of at least one."""
         for name in ("hidden_dim", "steps", "batch_size"):
             if getattr(self, name) < 1:
                 raise self.refuse(name, "at least 1")
+
+
+@RewardModelConfig.register_subclass("roborecover_policy_features")
+@dataclass
+class RoboRecoverPolicyFeaturesConfig(FeatureNetworkConfig):
+    """Whether the policy recovers by itself (SAFE; Gu et al. 2025, "Multitask Failure Detection for
+    Vision-Language-Action Models")."""
+
+
+@RewardModelConfig.register_subclass("roborecover_recovery_gain")
+@dataclass
+class RoboRecoverRecoveryGainConfig(FeatureNetworkConfig):
+    """What stepping in now would gain, P(success | intervene) - P(success | continue), fitted to forks."""
+
+    threshold: float | None = 0.0
+    """Gain above which it asks for help; `roborecover eval-monitor` never sets less than 0."""
+    arm: str = ""
+    """Of the forks that it is fitted to, or how that begins (`correction`); empty where they have one."""

@@ -20,9 +20,11 @@ from lerobot_roborecover.interventions.monitor.errors import MonitorError
 from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
 
 KINDS = (
-    "chunk_disagreement", "constant", "elapsed", "no_progress", "oracle", "policy_features", "state_distance",
+    "chunk_disagreement", "constant", "elapsed", "no_progress", "oracle", "policy_features", "recovery_gain",
+    "state_distance",
 )  # fmt: skip
-"""Kinds that need no checkpoint; `policy_features` and `state_distance` are fitted before they are asked."""
+"""Kinds that need no checkpoint; `policy_features`, `recovery_gain` and `state_distance` are fitted before
+they are asked."""
 
 
 def split_options(text: str) -> tuple[str, dict[str, str]]:

@@ -7,10 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_roborecover.interventions.detectors.base import DetectorRewardModel
+from lerobot_roborecover.interventions.detectors.base import PREFIX, DetectorRewardModel
 from lerobot_roborecover.interventions.detectors.configuration_policy import (
+    FeatureNetworkConfig,
     RoboRecoverChunkDisagreementConfig,
     RoboRecoverPolicyFeaturesConfig,
+    RoboRecoverRecoveryGainConfig,
 )
 from lerobot_roborecover.interventions.detectors.interface import CHUNKS, FEATURES, SEEN, DetectorNeeds
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
@@ -57,18 +59,15 @@ def _apart(a: Tensor, b: Tensor) -> Tensor:
     return (a[:, :, None] - b[:, None]).norm(dim=3).mean((1, 2))
 
 
-class RoboRecoverPolicyFeaturesRewardModel(DetectorRewardModel):
-    """Chance that the policy does not recover by itself, from its features of now."""
+class FeatureNetwork(DetectorRewardModel):
+    """A small network on the policy's features of now."""
 
-    config_class = RoboRecoverPolicyFeaturesConfig
-    name = "roborecover_policy_features"
-    config: RoboRecoverPolicyFeaturesConfig
     mean: Tensor
     """(F,) of the features that it was fitted to."""
     std: Tensor
     """(F,) of the same."""
 
-    def __init__(self, config: RoboRecoverPolicyFeaturesConfig, **_: Any):
+    def __init__(self, config: FeatureNetworkConfig, **_: Any):
         super().__init__(config)
         self.fitted = False
         if config.width:
@@ -79,14 +78,84 @@ class RoboRecoverPolicyFeaturesRewardModel(DetectorRewardModel):
         """The policy's features."""
         return DetectorNeeds(internals=True)
 
+    def restore(self, weights: Any) -> None:
+        """Takes saved weights."""
+        try:
+            self.load_state_dict(weights())
+        except RuntimeError as err:
+            raise MonitorError(f"{self._kind}: weights do not fit config.json: {err}") from None
+        self.fitted = True
+
+    @property
+    def _kind(self) -> str:
+        return self.config.type.removeprefix(PREFIX)
+
     def _build(self, width: int) -> None:
-        c = self.config
+        c: FeatureNetworkConfig = self.config
         c.width = width
         self.fill("mean", torch.zeros(width))
         self.fill("std", torch.ones(width))
         self.head = nn.Sequential(
             nn.Linear(width, c.hidden_dim), nn.GELU(), nn.Dropout(c.dropout), nn.Linear(c.hidden_dim, 1)
         )
+
+    def _train(self, features: Tensor, targets: Tensor, weights: Tensor) -> float:
+        """Towards the mean of what is seen where features are alike.
+
+        Args:
+            features: (N, F).
+            targets: (N,) from 0 to 1.
+            weights: (N,) of the losses.
+
+        Returns:
+            The last hundred steps' mean loss.
+        """
+        c = self.config
+        with torch.random.fork_rng(), torch.enable_grad():
+            torch.manual_seed(c.seed)
+            self._build(features.shape[1])
+            self.mean.copy_(features.mean(0))
+            std = features.std(0)
+            self.std.copy_(torch.where(std < 1e-6, torch.ones_like(std), std))
+            optimizer = torch.optim.AdamW(self.parameters(), c.learning_rate, weight_decay=c.weight_decay)
+            losses = []
+            self.train()
+            for _ in range(c.steps):
+                rows = torch.randint(len(targets), (c.batch_size,))
+                loss = nn.functional.binary_cross_entropy_with_logits(
+                    self._logits(features[rows]), targets[rows], weights[rows]
+                )
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                losses.append(loss.item())
+            self.eval()
+        self.fitted = True
+        return sum(losses[-100:]) / len(losses[-100:])
+
+    def _logits(self, features: Tensor) -> Tensor:
+        return self.head((features - self.mean) / self.std).squeeze(1)
+
+    def _means(self, batch: dict[str, Any]) -> Tensor:
+        """(B,) expected targets.
+
+        Raises:
+            MonitorError: it has not been fitted, or to another policy's features.
+        """
+        features = batch[FEATURES].float()
+        if not self.fitted or features.shape[1] != self.config.width:
+            raise MonitorError(
+                f"{self._kind} was fitted to {self.config.width} features; the policy has "
+                f"{features.shape[1]}. Fit it to this policy"
+            )
+        return torch.sigmoid(self._logits(features))
+
+
+class RoboRecoverPolicyFeaturesRewardModel(FeatureNetwork):
+    """Chance that the policy does not recover by itself."""
+
+    config_class = RoboRecoverPolicyFeaturesConfig
+    name = "roborecover_policy_features"
 
     def fit(self, features: Tensor, labels: Tensor) -> float:
         """Trains it; both labels weigh the same.
@@ -107,42 +176,9 @@ class RoboRecoverPolicyFeaturesRewardModel(DetectorRewardModel):
                 f"policy_features: {counts[0]} frames where the policy goes on by itself and {counts[1]} "
                 "where it does not; both are needed to learn from. Fit on more scenarios (--fit-split)"
             )
-        c = self.config
-        c.labels = {"0": counts[0], "1": counts[1]}
-        with torch.random.fork_rng(), torch.enable_grad():
-            torch.manual_seed(c.seed)
-            self._build(features.shape[1])
-            self.mean.copy_(features.mean(0))
-            std = features.std(0)
-            self.std.copy_(torch.where(std < 1e-6, torch.ones_like(std), std))
-            optimizer = torch.optim.AdamW(self.parameters(), c.learning_rate, weight_decay=c.weight_decay)
-            weight = torch.tensor([len(labels) / (2 * n) for n in counts])
-            losses = []
-            self.train()
-            for _ in range(c.steps):
-                rows = torch.randint(len(labels), (c.batch_size,))
-                logits = self._logits(features[rows])
-                loss = nn.functional.binary_cross_entropy_with_logits(
-                    logits, labels[rows].float(), weight[labels[rows].long()]
-                )
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
-                losses.append(loss.item())
-            self.eval()
-        self.fitted = True
-        return sum(losses[-100:]) / len(losses[-100:])
-
-    def restore(self, weights: Any) -> None:
-        """Takes saved weights."""
-        try:
-            self.load_state_dict(weights())
-        except RuntimeError as err:
-            raise MonitorError(f"policy_features: weights do not fit config.json: {err}") from None
-        self.fitted = True
-
-    def _logits(self, features: Tensor) -> Tensor:
-        return self.head((features - self.mean) / self.std).squeeze(1)
+        self.config.labels = {"0": counts[0], "1": counts[1]}
+        weights = torch.tensor([len(labels) / (2 * n) for n in counts])
+        return self._train(features, labels.float(), weights[labels.long()])
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """(B,) probabilities.
@@ -150,10 +186,44 @@ class RoboRecoverPolicyFeaturesRewardModel(DetectorRewardModel):
         Raises:
             MonitorError: it has not been fitted, or to another policy's features.
         """
-        features = batch[FEATURES].float()
-        if not self.fitted or features.shape[1] != self.config.width:
+        return self._means(batch)
+
+
+class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
+    """What stepping in now is expected to gain over going on: from -1, it harms, to 1, it rescues."""
+
+    config_class = RoboRecoverRecoveryGainConfig
+    name = "roborecover_recovery_gain"
+    least_threshold = 0.0
+
+    def fit(self, features: Tensor, gains: Tensor) -> float:
+        """Trains it: a state between gain and harm counts as the mean of what came of it, so that its output
+        is an expected gain.
+
+        Args:
+            features: (N, F) where trials were forked.
+            gains: (N,) success when somebody steps in, less success when the policy goes on.
+
+        Returns:
+            The last hundred steps' mean loss.
+
+        Raises:
+            MonitorError: stepping in changed nothing anywhere.
+        """
+        counts = {"rescued": gains > 0, "harmed": gains < 0, "alike": gains == 0}
+        self.config.labels = {name: int(rows.sum()) for name, rows in counts.items()}
+        if not self.config.labels["rescued"]:
             raise MonitorError(
-                f"policy_features was fitted to {self.config.width} features; the policy has "
-                f"{features.shape[1]}. Fit it to this policy"
+                f"recovery_gain: of {len(gains)} forks stepping in rescued none "
+                f"({self.config.labels['harmed']} harmed), so there is no gain to learn. Fork more trials "
+                "(roborecover fork --every), or with another --arm"
             )
-        return torch.sigmoid(self._logits(features))
+        return self._train(features, (1 + gains.float()) / 2, torch.ones(len(gains)))
+
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """(B,) expected gains.
+
+        Raises:
+            MonitorError: it has not been fitted, or to another policy's features.
+        """
+        return 2 * self._means(batch) - 1
