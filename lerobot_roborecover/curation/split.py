@@ -152,7 +152,7 @@ def shared(scenarios: Sequence[Scenario], apart: Sequence[str]) -> dict[str, dic
         if "instruction" in found:
             found["instruction"][f"{scenario.task.name}: {scenario.task.instruction}"].append(i)
         if "start" in found:
-            found["start"][" ".join(map(str, _start(scenario)))].append(i)
+            found["start"][" ".join(map(str, start_of(scenario)))].append(i)
     if "trajectory" in found:
         for name, members in _continuations(scenarios):
             found["trajectory"][name] += members
@@ -169,7 +169,7 @@ def _continuations(scenarios: Sequence[Scenario]) -> Iterable[tuple[str, list[in
     """
     by_start: dict[tuple, list[int]] = defaultdict(list)
     for i, s in enumerate(scenarios):
-        by_start[_start(s)].append(i)
+        by_start[start_of(s)].append(i)
     for members in by_start.values():
         for i in members:
             # Settling alone is what all rollouts from one reset share.
@@ -181,7 +181,8 @@ def _continuations(scenarios: Sequence[Scenario]) -> Iterable[tuple[str, list[in
                 yield f"beginning of {scenarios[i].id}", same
 
 
-def _start(scenario: Scenario) -> tuple:
+def start_of(scenario: Scenario) -> tuple:
+    """What scenarios that begin in the same simulator state have in common: task, seed, stored init state."""
     task, reset = scenario.task, scenario.reset
     return task.suite, task.name, reset.seed, reset.init_state_index, reset.settle_steps
 

@@ -13,8 +13,6 @@ finished is skipped. At the end, tables with intervals over runs and scenarios
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +22,13 @@ import numpy as np
 
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.whole import new_folder
+from recipes.commands import evaluate, roborecover
 from recipes.metaworld.dataset import STUDY_TASKS, Episode, create_dataset, save_episode
 from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_demonstrations
 from recipes.training import Training
 
 STUDY = Path("lerobot_roborecover/data/metaworld_study")
+SCENARIOS = STUDY / "scenarios"
 POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}
 """Policies whose recoveries are learned from, and their trials of each training scenario."""
 SEEDS = (0, 1, 2, 3)
@@ -54,43 +54,21 @@ MIXTURES = {
 }
 
 
-def program(*words: str | Path) -> None:
-    """Runs a module of this environment.
-
-    Raises:
-        subprocess.CalledProcessError: it failed; its own output says why.
-    """
-    subprocess.run([sys.executable, "-m", *map(str, words)], check=True)
-
-
-def evaluate(policy: Path, split: str, out: Path, trials: int, start: str = "recovery") -> Path:
-    """Trials of a policy on a split, with what was executed; finished ones are kept.
-
-    Returns:
-        The trial log.
-    """
-    log = out / "trials.jsonl"
-    program(
-        "lerobot_roborecover.cli.main", "eval", "--env", "roborecover_metaworld",
-        f"--env.scenarios={STUDY / 'scenarios'}", f"--env.split={split}", "--env.obs_type=state",
-        f"--env.start={start}", "--env.record_actions=true", f"--env.trial_log={log}",
-        f"--policy.path={policy}", "--policy.device=cpu", f"--eval.n_episodes={trials}",
-        f"--output_dir={out / 'eval'}",
-    )  # fmt: skip
-    return log
-
-
 def make_recoveries(out: Path, pool: dict[str, int]) -> Path:
     """Successful trials from the training scenarios, as a LeRobotDataset."""
     root = out / "recoveries"
     if not root.exists():
+        policies = STUDY / "policies"
         logs = [
-            evaluate(STUDY / "policies" / name, "train", out / "pool" / name, trials)
+            evaluate(
+                "metaworld", SCENARIOS, "train", out / "pool" / name, f"--policy.path={policies / name}",
+                trials=trials,
+            )
             for name, trials in pool.items()
-        ]
-        program(
-            "lerobot_roborecover.cli.main", "export-training", *logs, "--scenarios", STUDY / "scenarios",
-            "--split", "train", "--env", "obs_type=state", "--of", "successes", "--out", root,
+        ]  # fmt: skip
+        roborecover(
+            "export-training", *logs, "--scenarios", SCENARIOS, "--split", "train", "--env", "obs_type=state",
+            "--of", "successes", "--out", root,
         )  # fmt: skip
     return root
 
@@ -224,10 +202,10 @@ def main() -> None:
             policy = train(args.out, name, seed, [f"--{o}" for o in args.train_option])
             folder = args.out / "results" / policy.name
             for start in ("recovery", "initial"):
-                log = evaluate(policy, "test", folder, 1, start)
+                log = evaluate("metaworld", SCENARIOS, "test", folder, f"--policy.path={policy}", start=start)
             logs.setdefault(name, []).append(str(log))
-    program(
-        "lerobot_roborecover.cli.main", "report", *(f"{n}={','.join(of)}" for n, of in logs.items()),
+    roborecover(
+        "report", *(f"{n}={','.join(of)}" for n, of in logs.items()),
         "--out", args.out / "report",
     )  # fmt: skip
 

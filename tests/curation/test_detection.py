@@ -46,7 +46,8 @@ def played(monkeypatch):
 
     def run_trials(policy, env, folder, **_):
         asked.append(folder.name)
-        return played_trials(list(load_scenarios(env.scenarios, split=env.split)), env.start)
+        chosen = load_scenarios(env.scenarios, split=env.split, select=env.select)
+        return played_trials(list(chosen), env.start)
 
     monkeypatch.setattr(trials, "run_trials", run_trials)
     return asked
@@ -125,6 +126,11 @@ def test_a_rerun_looks_at_nothing_twice(dataset, policy, tmp_path, played, monke
     assert played == ["test-recovery", "test-initial"]  # nothing is to be fitted: no other split is run
     monkeypatch.setattr(trials, "replayed", lambda *_: pytest.fail("replayed again"))
     assert main(command(dataset, policy, tmp_path / "out", detectors=few)) == 0
+
+
+def test_one_part_of_a_split_is_fitted_to_and_another_measured_on(dataset, policy, tmp_path, played):
+    parts = ["--split", "test", "--fit-split", "test", "--select", "id=*-00*", "--fit-select", "id=*-01*"]
+    assert main(command(dataset, policy, tmp_path / "out", *parts, detectors=("state_distance,k=1",))) == 0
 
 
 @pytest.mark.parametrize(

@@ -266,10 +266,23 @@ def _forks(
     return found
 
 
+def _shared(request: DetectionRequest) -> bool:
+    """Whether scenarios that are fitted to are measured on, too."""
+    source = request.source
+    fitted, measured = (
+        {s.id for s in load_scenarios(source.scenarios, revision=source.revision, split=split, select=select)}
+        for split, select in (
+            (request.fit_split, source.select if request.fit_select is None else request.fit_select),
+            (request.split, source.select),
+        )
+    )
+    return bool(fitted & measured)
+
+
 def _check_fitting(named: Sequence[NamedDetector], request: DetectionRequest) -> None:
     """Refuses to fit to what is measured on, or to a training set that is not there; before anything runs."""
     learning = [n.name for n in named if _learns_from_trials(n, request)]
-    if learning and request.fit_split == request.split:
+    if learning and request.fit_split == request.split and _shared(request):
         raise ScenarioError(
             f"--fit-split {request.fit_split} is what is measured on; detectors that learn "
             f"({', '.join(learning)}) are fitted to other scenarios"

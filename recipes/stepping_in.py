@@ -1,0 +1,188 @@
+"""Does stepping in help? A detector that has learned from forks when Correction pays, against letting the
+policy go on and against stepping in always, where nothing was learned (docs/stepping_in.md).
+
+    python -m recipes.stepping_in --platform libero --out outputs/stepping_in
+    python -m recipes.stepping_in --platform metaworld --out outputs/stepping_in_metaworld
+
+The training scenarios are divided, by what they share, into three parts. On one, Correction is trained
+(`roborecover donors`, `lerobot-train`); on the next, the base's trials are forked with that Correction, and
+detectors fitted; on the third, their thresholds are set. Then every arm is run on the test scenarios, and
+reported. What is finished is skipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_roborecover.curation.split import start_of
+from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.scenario import Scenario
+from recipes.commands import evaluate, program, roborecover
+
+PARTS = {"donors": 0.45, "forks": 0.35, "thresholds": 0.2}
+"""Shares of the training scenarios."""
+DETECTORS = {"gain": "recovery_gain", "features": "policy_features", "elapsed": "elapsed"}
+ALPHA = 0.1
+"""Chance of a false alarm in a clean rollout that the thresholds allow."""
+BASELINE = "direct"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whom to help, where, and by whose example."""
+
+    scenarios: str
+    base: Path
+    """Deterministic: a trial of it is run once."""
+    donors: tuple[Path, ...]
+    """Deterministic policies whose recoveries Correction learns from."""
+    fork_every: int
+    """Control steps."""
+
+
+_LIBERO = Path("policies/libero")
+_METAWORLD = Path("lerobot_roborecover/data/metaworld_study/policies")
+SUBJECTS = {
+    "libero": Subject(
+        "libero_recovery", _LIBERO / "act_few",
+        (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 30,
+    ),
+    "metaworld": Subject(
+        str(_METAWORLD.parent / "scenarios"), _METAWORLD / "act",
+        (_METAWORLD / "tdmpc", _METAWORLD / "act_few", _METAWORLD / "act_clean"), 15,
+    ),
+}  # fmt: skip
+
+
+def divide(scenarios: Iterable[Scenario]) -> dict[str, list[str]]:
+    """Ids by part; scenarios that begin alike are in one. Which one is drawn from how they begin."""
+    found: dict[str, list[str]] = {part: [] for part in PARTS}
+    for scenario in scenarios:
+        at = int.from_bytes(hashlib.sha256(repr(start_of(scenario)).encode()).digest()[:8]) / 2**64
+        for part, share in PARTS.items():
+            if at < share:
+                found[part].append(scenario.id)
+                break
+            at -= share
+    return found
+
+
+@dataclass(frozen=True)
+class SteppingIn:
+    """One platform's runs, all in one folder."""
+
+    platform: str
+    subject: Subject
+    out: Path
+    parts: dict[str, list[str]]
+    every: int
+
+    def trials(self, part: str, policy: Path, start: str = "recovery") -> Path:
+        """Log of a policy's trials on a part of the training scenarios, one observation at a time, so that
+        they can be forked."""
+        return evaluate(
+            self.platform, self.subject.scenarios, "train", self.out / "train" / part / policy.name,
+            "--runner.max_batch=1", f"--policy.path={policy}", start=start, ids=self.parts[part],
+        )  # fmt: skip
+
+    def correction(self) -> Path:
+        """Trained on the donors' part."""
+        made, training = self.out / "correction", self.out / "correction_training"
+        if made.exists():
+            return made
+        donors, base = self.out / "donors", self.subject.base
+        if not donors.exists():
+            logs = [self.trials("donors", policy) for policy in (base, *self.subject.donors)]
+            named = [word for policy in self.subject.donors for word in ("--donor", str(policy))]
+            roborecover(
+                "donors", *logs, "--scenarios", self.subject.scenarios, "--base", base, *named,
+                "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
+            )  # fmt: skip
+        program(
+            "recipes.frames_in_memory", "--config_path=policies/train/correction_act.yaml",
+            f"--policy.path={base}", "--dataset.repo_id=local/donors", f"--dataset.root={donors}",
+            f"--output_dir={training}",
+        )  # fmt: skip
+        roborecover("export-ema", training / "checkpoints" / "last", "--out", made)
+        return made
+
+    def forks(self, correction: Path) -> Path:
+        """Of the base's trials on the forks' part, from recovery points and from the start."""
+        log = self.trials("forks", self.subject.base)
+        self.trials("forks", self.subject.base, "initial")
+        out = self.out / "forks"
+        roborecover(
+            "fork", log, "--policy", self.subject.base, "--arm", f"correction:{correction}",
+            "--every", str(self.every), "--out", out,
+        )  # fmt: skip
+        return out
+
+    def detectors(self, forks: Path) -> Path:
+        """Fitted on the forks' part, thresholds of the third."""
+        out = self.out / "detectors"
+        named = [word for name, what in DETECTORS.items() for word in ("--detector", f"{name}={what}")]
+        roborecover(
+            "eval-monitor", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
+            "--env", "obs_type=state", *named, "--forks", forks, "--split", "train",
+            "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",
+            "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA), "--films", "0",
+            "--workers", "2", "--out", out,
+        )  # fmt: skip
+        return out / "detectors"
+
+    def arm(self, name: str, *options: str) -> str:
+        """One arm on the test scenarios, as `roborecover report` takes it."""
+        log = evaluate(
+            self.platform, self.subject.scenarios, "test", self.out / "test" / name,
+            "--policy.type=roborecover_intervention", f"--policy.base.path={self.subject.base}", *options,
+        )  # fmt: skip
+        return f"{name}={log}"
+
+    def run(self) -> None:
+        """Everything, then the report."""
+        correction = self.correction()
+        detectors = self.detectors(self.forks(correction))
+        by_correction = f"--policy.correction.path={correction}"
+        logs = [
+            self.arm(BASELINE, "--policy.mode=direct"),
+            self.arm("reversion", "--policy.mode=reversion"),
+            self.arm("correction", "--policy.mode=correction", by_correction),
+        ]
+        for name in DETECTORS:
+            monitor = f"--policy.monitor.path={detectors / name}"
+            logs.append(self.arm(name, "--policy.mode=monitor_correction", by_correction, monitor))
+        roborecover("report", *logs, "--baseline", BASELINE, "--out", self.out / "report")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--platform", choices=SUBJECTS, default="libero", help="(%(default)s)")
+    add("--out", type=Path, required=True, help="folder to work in; a rerun goes on there")
+    add("--scenarios", help="another set of the platform, with the splits train and test")
+    add("--every", type=int, help="fork every so many steps")
+    args = parser.parse_args()
+    subject = SUBJECTS[args.platform]
+    if not subject.base.is_dir():
+        parser.error(
+            f"{subject.base} is not here: run this in the top folder of a checkout of the repository"
+        )
+    if args.scenarios:
+        subject = Subject(args.scenarios, subject.base, subject.donors, subject.fork_every)
+    parts = divide(load_scenarios(subject.scenarios, split="train"))
+    print(
+        f"training scenarios: {', '.join(f'{len(ids)} for {part}' for part, ids in parts.items())}",
+        flush=True,
+    )
+    SteppingIn(args.platform, subject, args.out, parts, args.every or subject.fork_every).run()
+
+
+if __name__ == "__main__":
+    main()
