@@ -77,7 +77,7 @@ def _decisions(path: Path, records: Iterable[dict[str, Any]]) -> list[Decision]:
         except TypeError as err:
             raise ScenarioError(f"{path}: {err}; it was not written by this package") from None
         good = decision.stage in STAGES and decision.verdict in ("kept", "dropped", "undecided")
-        if not good or not all(isinstance(value, str) for value in asdict(decision).values()):
+        if not good or not all(isinstance(value, str) for value in vars(decision).values()):
             raise ScenarioError(f"{path}: {record!r:.200} is not a decision of a stage on a candidate")
         decisions.append(decision)
     return decisions

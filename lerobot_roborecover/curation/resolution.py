@@ -148,7 +148,8 @@ def resolve(candidates: CandidateSet, folder: Path, config: ResolutionConfig) ->
             f"{folder} holds votes of {len(names)} annotators ({', '.join(names)}), but "
             f"{config.annotators} are expected. Say --votes-needed {len(names)}, or move a file away"
         )
-    queue = [c.id for c in candidates.candidates if c.id in queued(candidates)]
+    asked = queued(candidates)
+    queue = [c.id for c in candidates.candidates if c.id in asked]
     rounds = 1
     latest: dict[str, dict[str, Vote]] = {c: {} for c in queue}
     blind: dict[str, list[Vote]] = {c: [] for c in queue}
