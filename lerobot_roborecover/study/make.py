@@ -58,6 +58,21 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
     scenarios = out / "scenarios" / "split"
     env = [part for name, value in recipe.env.items() for part in ("--env", f"{name}={value}")]
     logs = [str(trials / name / "trials.jsonl") for name in screening]
+    base_trials = out / "base_trials"
+    # A base that had no say in screening has no trials yet.
+    of_base = [] if recipe.base in screening else [
+        StudyStage(
+            "base trials",
+            (_cli(
+                "eval", "--env", f"roborecover_{recipe.platform}", f"--env.scenarios={scenarios}",
+                "--env.split=train", *(f"--env.{name}={value}" for name, value in recipe.env.items()),
+                f"--policy.path={policy(recipe.base)}", f"--eval.n_episodes={recipe.policies[recipe.base]}",
+                f"--output_dir={base_trials}",
+            ),),
+            (base_trials / "eval_info.json",),
+        )
+    ]  # fmt: skip
+    logs += [str(base_trials / "trials.jsonl")] if of_base else []
     donors = [part for name in screening if name != recipe.base for part in ("--donor", policy(name))]
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
@@ -80,6 +95,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
             (_cli("build", str(out / Path(recipe.chain).name)),),
             (scenarios,),
         ),
+        *of_base,
         StudyStage(
             "donors",
             (_cli(

@@ -178,7 +178,8 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path,
 
 def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
     recipe = read_recipe("libero")
-    policies, *_, metrics = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
+    found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
+    policies, *_, metrics = found
     assert policies.commands == ()
     assert all(path.is_dir() for path in policies.done)
     assert metrics.name == "monitor metrics"
@@ -187,6 +188,13 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
     assert recorded == {str(tmp_path / name) for name in recipe.recordings}, (
         "the chain takes what is recorded"
     )
+    # Its base was kept out of screening: it is run on the training scenarios before donors are sought.
+    assert recipe.base not in {p.name for p in chain.screen.policies}
+    names = [s.name for s in found]
+    assert names.index("scenarios") + 1 == names.index("base trials") == names.index("donors") - 1
+    run, donors = found[names.index("base trials")].commands[0], found[names.index("donors")].commands[0]
+    assert "--env.split=train" in run
+    assert str(tmp_path / "base_trials" / "trials.jsonl") in donors
 
 
 @pytest.mark.parametrize(
