@@ -4,8 +4,8 @@
 #     docker run --rm roborecover-cpu                       # roborecover doctor
 #     docker run --rm -v "$PWD/outputs:/lerobot/outputs" roborecover-cpu roborecover demo
 #
-# As LeRobot's images: /lerobot with a virtual environment, the user user_lerobot. The base is pinned by its tag.
-FROM python:3.12-slim-bookworm
+# As LeRobot's images: /lerobot with a virtual environment, the user user_lerobot. The base is pinned by its digest.
+FROM python:3.12.15-slim-bookworm@sha256:54c85f3c47607a77f32adec749d3c81d1348bf25833671f512b26a9b6d778cb3
 
 ENV DEBIAN_FRONTEND=noninteractive \
     MUJOCO_GL=egl \

@@ -6,8 +6,8 @@
 #         roborecover reproduce pi05_libero --set policy.device=cuda
 #
 # The host needs the NVIDIA Container Toolkit, and a driver that PyTorch's CUDA wheels run on. As LeRobot's images:
-# /lerobot with a virtual environment, the user user_lerobot. The base is pinned by its tag.
-FROM python:3.12-slim-bookworm
+# /lerobot with a virtual environment, the user user_lerobot. The base is pinned by its digest.
+FROM python:3.12.15-slim-bookworm@sha256:54c85f3c47607a77f32adec749d3c81d1348bf25833671f512b26a9b6d778cb3
 
 # `graphics` has the toolkit mount the driver's EGL part as well.
 ENV DEBIAN_FRONTEND=noninteractive \

@@ -8,7 +8,7 @@
 #
 # The host needs the NVIDIA Container Toolkit, and a driver that PyTorch's CUDA wheels run on. curobo is not in the
 # image: joint actions do not need it.
-FROM python:3.12-slim-bookworm
+FROM python:3.12.15-slim-bookworm@sha256:54c85f3c47607a77f32adec749d3c81d1348bf25833671f512b26a9b6d778cb3
 
 # `graphics` has the toolkit mount the driver's Vulkan part as well.
 ENV NVIDIA_VISIBLE_DEVICES=all \
