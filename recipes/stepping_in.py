@@ -15,13 +15,14 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.scenario import Scenario
-from recipes.commands import evaluate, program, roborecover
+from recipes.commands import evaluate, roborecover
+from recipes.training import Training
 
 PARTS = {"donors": 0.45, "forks": 0.35, "thresholds": 0.2}
 """Shares of the training scenarios."""
@@ -79,7 +80,6 @@ class SteppingIn:
     subject: Subject
     out: Path
     parts: dict[str, list[str]]
-    every: int
 
     def trials(self, part: str, policy: Path, start: str = "recovery") -> Path:
         """Log of a policy's trials on a part of the training scenarios, one observation at a time, so that
@@ -91,7 +91,7 @@ class SteppingIn:
 
     def correction(self) -> Path:
         """Trained on the donors' part."""
-        made, training = self.out / "correction", self.out / "correction_training"
+        made = self.out / "correction"
         if made.exists():
             return made
         donors, base = self.out / "donors", self.subject.base
@@ -102,12 +102,11 @@ class SteppingIn:
                 "donors", *logs, "--scenarios", self.subject.scenarios, "--base", base, *named,
                 "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
             )  # fmt: skip
-        program(
-            "recipes.frames_in_memory", "--config_path=policies/train/correction_act.yaml",
-            f"--policy.path={base}", "--dataset.repo_id=local/donors", f"--dataset.root={donors}",
-            f"--output_dir={training}",
+        training = Training(
+            Path("policies/train/correction_act.yaml"), donors, self.out / "correction_training",
+            options=(f"--policy.path={base}", "--dataset.repo_id=local/donors"),
         )  # fmt: skip
-        roborecover("export-ema", training / "checkpoints" / "last", "--out", made)
+        roborecover("export-ema", training.train(), "--out", made)
         return made
 
     def forks(self, correction: Path) -> Path:
@@ -117,7 +116,7 @@ class SteppingIn:
         out = self.out / "forks"
         roborecover(
             "fork", log, "--policy", self.subject.base, "--arm", f"correction:{correction}",
-            "--every", str(self.every), "--out", out,
+            "--every", str(self.subject.fork_every), "--out", out,
         )  # fmt: skip
         return out
 
@@ -174,14 +173,15 @@ def main() -> None:
         parser.error(
             f"{subject.base} is not here: run this in the top folder of a checkout of the repository"
         )
-    if args.scenarios:
-        subject = Subject(args.scenarios, subject.base, subject.donors, subject.fork_every)
+    subject = replace(
+        subject, scenarios=args.scenarios or subject.scenarios, fork_every=args.every or subject.fork_every
+    )
     parts = divide(load_scenarios(subject.scenarios, split="train"))
     print(
         f"training scenarios: {', '.join(f'{len(ids)} for {part}' for part, ids in parts.items())}",
         flush=True,
     )
-    SteppingIn(args.platform, subject, args.out, parts, args.every or subject.fork_every).run()
+    SteppingIn(args.platform, subject, args.out, parts).run()
 
 
 if __name__ == "__main__":

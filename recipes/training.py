@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.whole import new_folder
+from recipes.commands import program
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,11 @@ class Training:
             *self.options,
         ]
 
-    def run(self, result: Path) -> None:
-        """Trains, from memory, and puts the policy into `result`.
+    def train(self) -> Path:
+        """Trains, from memory.
+
+        Returns:
+            The last checkpoint.
 
         Raises:
             subprocess.CalledProcessError: the training failed; its own output says why.
@@ -52,11 +54,19 @@ class Training:
         arguments = self.arguments()
         if "--resume=true" not in arguments:  # LeRobot refuses the folder of a run without a checkpoint
             shutil.rmtree(self.folder, ignore_errors=True)
-        program = [sys.executable, "-m", "recipes.frames_in_memory"]
-        subprocess.run([*program, *arguments], check=True)
+        program("recipes.frames_in_memory", *arguments)
+        return self.folder / "checkpoints" / "last"
+
+    def run(self, result: Path) -> None:
+        """Trains, and puts the policy into `result`.
+
+        Raises:
+            subprocess.CalledProcessError: as `train`.
+        """
+        last = self.train()
         with new_folder(result) as policy:
             shutil.copytree(
-                self.folder / "checkpoints" / "last" / "pretrained_model",
+                last / "pretrained_model",
                 policy,
                 ignore=shutil.ignore_patterns("train_config.json"),
             )
