@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,7 +96,10 @@ class SteppingIn:
         if made.exists():
             return made
         donors, base = self.out / "donors", self.subject.base
-        if not donors.exists():
+        if not (donors / "meta" / "roborecover" / "donors.json").exists():
+            shutil.rmtree(
+                donors, ignore_errors=True
+            )  # of a run that was cut short; its trials are kept beside it
             logs = [self.trials("donors", policy) for policy in (base, *self.subject.donors)]
             named = [word for policy in self.subject.donors for word in ("--donor", str(policy))]
             roborecover(

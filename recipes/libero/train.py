@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from recipes.commands import program
 from recipes.libero.demonstrations import part_of, tasks_of, write_dataset
 from recipes.training import Training
 
@@ -76,7 +75,7 @@ def make_demonstrations(out: Path, workers: int) -> None:
     Raises:
         subprocess.CalledProcessError: one failed; its own output says why.
     """
-    program = [sys.executable, "-m", "recipes.libero.demonstrations", f"--workers={workers}"]
+    maker = ["recipes.libero.demonstrations", f"--workers={workers}"]
     given = [f"--episodes-per-task={EPISODES_PER_TASK}", f"--parts={out / 'demonstrations.parts'}"]
     suites = sorted({suite for found in WITH_EYES.values() for suite in found})
     for name, more in {
@@ -84,7 +83,7 @@ def make_demonstrations(out: Path, workers: int) -> None:
         "pictures": [f"--pictures={_SIDE}", "--suites", *suites],
     }.items():
         if not (out / name).exists():
-            subprocess.run([*program, *given, f"--out={out / name}", *more], check=True)
+            program(*maker, *given, f"--out={out / name}", *more)
 
 
 def make_recoveries(out: Path, after: Sequence[str], workers: int) -> None:
@@ -101,11 +100,11 @@ def make_recoveries(out: Path, after: Sequence[str], workers: int) -> None:
     if (out / "with_recoveries").exists():
         return
     if not (out / "recoveries").exists():
-        program = [sys.executable, "-m", "recipes.libero.demonstrations", f"--workers={workers}"]
-        given = [f"--episodes-per-task={RECOVERIES_PER_TASK}", f"--out={out / 'recoveries'}"]
-        subprocess.run(
-            [*program, *given, "--after", *(f"policies/libero/{name}" for name in after)], check=True
-        )
+        program(
+            "recipes.libero.demonstrations", f"--workers={workers}",
+            f"--episodes-per-task={RECOVERIES_PER_TASK}", f"--out={out / 'recoveries'}",
+            "--after", *(f"policies/libero/{name}" for name in after),
+        )  # fmt: skip
     parts = [
         (task, part)
         for folder in ("demonstrations.parts", "recoveries.parts")

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 from lerobot_roborecover.analysis.conformal import least_rollouts
 from lerobot_roborecover.analysis.contrasts import Contrast
@@ -15,19 +15,16 @@ from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
 from lerobot_roborecover.analysis.detection_page import MeasuredDetector
 from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.curation.detection.fitting import (
-    check_training_data,
-    fit_features,
-    fit_gain,
-    fit_states,
+from lerobot_roborecover.curation.detection.learning import (
+    check_fitting,
+    check_held_out,
+    fit_detectors,
+    fork_logs,
 )
-from lerobot_roborecover.curation.detection.forked import ForkLog, read_forks, see_forks
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks, cost_ms, score_trials
 from lerobot_roborecover.curation.detection.trials import SeenTrial, TrialSource, see_trials
-from lerobot_roborecover.curation.monitor_data.data import check_disjoint
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
-from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.interventions.detectors.base import DetectorRewardModel
 from lerobot_roborecover.interventions.detectors.interface import Detector, MonitorDetector
 from lerobot_roborecover.interventions.detectors.loading import (
@@ -36,17 +33,11 @@ from lerobot_roborecover.interventions.detectors.loading import (
     split_options,
 )
 from lerobot_roborecover.interventions.detectors.modeling_policy import (
-    FeatureNetwork,
     RoboRecoverPolicyFeaturesRewardModel,
-    RoboRecoverRecoveryGainRewardModel,
-)
-from lerobot_roborecover.interventions.detectors.modeling_states import (
-    RoboRecoverStateDistanceRewardModel,
 )
 from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
 from lerobot_roborecover.interventions.detectors.progress import ProgressDetector
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
-from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_folder
 
 TRUTHS = ("recovery_point", "outcome")
@@ -158,9 +149,9 @@ def compare_detectors(
     links = [ScenarioLink(s.id, s.sha256(), "") for s in scenarios]
     if not request.on_training_scenarios:
         for n in named:
-            _check_held_out(n, links)
-    _check_fitting(named, request)
-    forks = _forks(named, request, links)
+            check_held_out(n, links)
+    check_fitting(named, request, links)
+    forks = fork_logs(named, request, links)
     host, features = _host(request, scenarios.platform)
     policy, pre, _ = host.parts
     probe = PolicyProbe(policy, pre)
@@ -168,7 +159,7 @@ def compare_detectors(
         check_needs(f"--detector {n.name}", n.detector.needs, features, probe, TRUTHS)
     looks = PolicyLooks(probe)
     trials, dropped = see_trials(source, request.split, host.env_batch, progress)
-    _fit(named, request, forks, host, looks, links, progress)
+    fit_detectors(named, request, forks, host, looks, links, progress)
     remarks = _remarks(trials, request)
     measured, scored = [], {}
     for n in named:
@@ -225,100 +216,6 @@ def _host(request: DetectionRequest, platform: str) -> tuple[Any, dict[str, Any]
             f"process; this is a {config.type!r} policy. Name the policy within"
         )
     return host, env_to_policy_features(env)
-
-
-def _check_held_out(named: NamedDetector, links: Sequence[ScenarioLink]) -> None:
-    trained = [ScenarioLink(i, sha, "") for i, sha in named.trained_on.items()]
-    check_disjoint(trained, links, f"--detector {named.name}")
-
-
-def _learns_from_trials(named: NamedDetector, request: DetectionRequest) -> bool:
-    learns = not getattr(named.detector, "fitted", True) and not _learns_from_forks(named.detector)
-    of_states = isinstance(named.detector, RoboRecoverStateDistanceRewardModel)
-    return learns and not (of_states and request.training_data is not None)
-
-
-def _learns_from_forks(detector: Detector) -> TypeGuard[RoboRecoverRecoveryGainRewardModel]:
-    return isinstance(detector, RoboRecoverRecoveryGainRewardModel) and not detector.fitted
-
-
-def _forks(
-    named: Sequence[NamedDetector], request: DetectionRequest, links: Sequence[ScenarioLink]
-) -> dict[str, ForkLog]:
-    """By detector, the forks that it learns from; refused before anything runs."""
-    from lerobot_roborecover.trials.load import policy_config
-
-    learning = {n.name: d for n in named if _learns_from_forks(d := n.detector)}
-    if bool(learning) != (request.forks is not None):
-        raise MonitorError(
-            f"--detector {min(learning)} learns from forks: give --forks LOG, which `roborecover fork` makes "
-            "of the policy's trials on other scenarios"
-            if learning
-            else f"--forks {request.forks}: no detector learns from forks; add --detector recovery_gain"
-        )
-    if request.forks is None:
-        return {}
-    source = request.source
-    policy = facts_of(policy_config(source.policy, (), source.device)).policy
-    found = {name: read_forks(request.forks, policy, d.config.arm) for name, d in learning.items()}
-    for log in found.values():
-        check_disjoint(log.links, links, f"--forks {request.forks}")
-    return found
-
-
-def _shared(request: DetectionRequest) -> bool:
-    """Whether scenarios that are fitted to are measured on, too."""
-    source = request.source
-    fitted, measured = (
-        {s.id for s in load_scenarios(source.scenarios, revision=source.revision, split=split, select=select)}
-        for split, select in (
-            (request.fit_split, source.select if request.fit_select is None else request.fit_select),
-            (request.split, source.select),
-        )
-    )
-    return bool(fitted & measured)
-
-
-def _check_fitting(named: Sequence[NamedDetector], request: DetectionRequest) -> None:
-    """Refuses to fit to what is measured on, or to a training set that is not there; before anything runs."""
-    learning = [n.name for n in named if _learns_from_trials(n, request)]
-    if learning and request.fit_split == request.split and _shared(request):
-        raise ScenarioError(
-            f"--fit-split {request.fit_split} is what is measured on; detectors that learn "
-            f"({', '.join(learning)}) are fitted to other scenarios"
-        )
-    if request.training_data is not None:
-        check_training_data(request.training_data)
-
-
-def _fit(
-    named: Sequence[NamedDetector],
-    request: DetectionRequest,
-    forks: Mapping[str, ForkLog],
-    host: Any,
-    looks: PolicyLooks,
-    links: Sequence[ScenarioLink],
-    progress: Callable[[str, int, int], None],
-) -> None:
-    todo = [n for n in named if not getattr(n.detector, "fitted", True)]
-    trials: list[SeenTrial] = []
-    if any(_learns_from_trials(n, request) for n in todo):
-        source = request.source
-        if request.fit_select is not None:
-            source = replace(source, select=request.fit_select)
-        trials, _ = see_trials(source, request.fit_split, host.env_batch, progress)
-    for n in todo:
-        if isinstance(n.detector, RoboRecoverStateDistanceRewardModel):
-            n.fitted_to = fit_states(n.detector, trials, request.training_data)
-        elif isinstance(n.detector, RoboRecoverPolicyFeaturesRewardModel):
-            n.fitted_to = fit_features(n.detector, trials, looks)
-        elif isinstance(n.detector, RoboRecoverRecoveryGainRewardModel):
-            seen = see_forks(forks[n.name], request.source, host.env_batch, progress)
-            n.fitted_to = fit_gain(n.detector, seen, looks)
-            n.detector.config.arm = forks[n.name].arm
-        if isinstance(n.detector, FeatureNetwork):
-            n.detector.config.policy = looks.probe.kind if looks.probe else ""
-        _check_held_out(n, links)
 
 
 def _remarks(trials: Sequence[SeenTrial], request: DetectionRequest) -> list[str]:

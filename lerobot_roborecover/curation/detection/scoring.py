@@ -42,17 +42,16 @@ class PolicyLooks:
     probe: PolicyProbe | None
 
     def __post_init__(self):
-        # With the trial itself: another one may get the id of one that is gone.
-        self._kept: dict[tuple[int, int, bool], tuple[SeenTrial, list[Looks]]] = {}
+        self._kept: dict[tuple[tuple, int, bool], list[Looks]] = {}
 
     def of(self, trial: SeenTrial, needs: DetectorNeeds) -> list[Looks]:
         """By segment of the trial, and step of it."""
         if not needs.of_policy or self.probe is None:
             return [[(None, None)] * (s.stop - s.start) for s in trial.segments]
-        key = (id(trial), needs.chunks, needs.internals)
+        key = (trial.row.key(), needs.chunks, needs.internals)
         if key not in self._kept:
-            self._kept[key] = trial, [self._look(trial, s, needs, self.probe) for s in trial.segments]
-        return self._kept[key][1]
+            self._kept[key] = [self._look(trial, s, needs, self.probe) for s in trial.segments]
+        return self._kept[key]
 
     def _look(self, trial: SeenTrial, segment: slice, needs: DetectorNeeds, probe: PolicyProbe) -> Looks:
         steps = observations_of(trial, segment)
