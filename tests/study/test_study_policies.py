@@ -136,7 +136,6 @@ def test_each_policy_learns_from_its_share_of_every_task():
 
 
 def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
-    from recipes import training
     from recipes.metaworld import study_policies
 
     commands = []
@@ -153,7 +152,7 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
         if "--resume=true" not in command:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.subprocess, "run", stopped)
+    monkeypatch.setattr("recipes.commands.subprocess.run", stopped)
     (tmp_path / "train" / "act").mkdir(parents=True)  # of a run killed before its first checkpoint
     with pytest.raises(KeyboardInterrupt):
         study_policies.train("act", tmp_path)
