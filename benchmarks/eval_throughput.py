@@ -29,7 +29,7 @@ import numpy as np
 from scipy import stats
 
 from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.env.trial_log import Protocol
+from lerobot_roborecover.env.trial_row import Protocol
 from lerobot_roborecover.policies.host import InlineReplica
 from lerobot_roborecover.trials.engine import Engine, units_of
 from tests.support.factories import fake_scenario

@@ -20,7 +20,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.make import report
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.env.trial_log import TrialRow
+    from lerobot_roborecover.env.trial_row import TrialRow
     from lerobot_roborecover.platforms import Platform
     from lerobot_roborecover.scenario import Rollout, Scenario
     from lerobot_roborecover.trials.evaluation import evaluate
@@ -44,7 +44,7 @@ _WHERE = {
     "Platform": "platforms",
     "Rollout": "scenario",
     "Scenario": "scenario",
-    "TrialRow": "env.trial_log",
+    "TrialRow": "env.trial_row",
     "evaluate": "trials.evaluation",
     "load_scenarios": "datasets",
     "metrics_of": "trials.training",

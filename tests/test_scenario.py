@@ -11,7 +11,7 @@ import pytest
 import lerobot_roborecover.scenario as records
 from lerobot_roborecover.curation.collect.starts import make_units
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_log import Protocol, make_row
+from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.platforms.starts import Starts
 from lerobot_roborecover.scenario import Outcome, Reset, Rollout, Scenario, ScenarioError, Task
 

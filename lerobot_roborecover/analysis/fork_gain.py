@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit, default_unit, unit_labels
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 
 FORK = "fork"

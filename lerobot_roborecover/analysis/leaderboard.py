@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis import published
+from lerobot_roborecover.analysis.arms import Arm, arm_of, stopped
 from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
-from lerobot_roborecover.analysis.logs import Arm, arm_of, clock_of, stopped
+from lerobot_roborecover.analysis.logs import clock_of
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import Panel, make_panel
 from lerobot_roborecover.analysis.resampling import resample
@@ -30,7 +31,8 @@ from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
 
 LEADERBOARD_SCHEMA = 1

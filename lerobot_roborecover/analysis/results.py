@@ -9,12 +9,13 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.compared import Compared, compared
 from lerobot_roborecover.analysis.contrasts import Contrast, adjusted, contrasts
 from lerobot_roborecover.analysis.costs import InterventionCost, intervention_cost
 from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
 from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
-from lerobot_roborecover.analysis.logs import Arm, Study
+from lerobot_roborecover.analysis.logs import Study
 from lerobot_roborecover.analysis.panel import Panel, make_panel
 from lerobot_roborecover.analysis.resampling import SEED, Resampling, masked_mean, resample
 from lerobot_roborecover.analysis.runs import (

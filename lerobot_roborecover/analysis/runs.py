@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.contrasts import Contrast, holm
 from lerobot_roborecover.analysis.intervals import (
     UNDEFINED,
@@ -34,7 +35,6 @@ from lerobot_roborecover.analysis.intervals import (
     estimate_of,
     rate_interval,
 )
-from lerobot_roborecover.analysis.logs import Arm
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
 from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, ComparisonVerdict, method_verdict

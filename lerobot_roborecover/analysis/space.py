@@ -16,7 +16,7 @@ from lerobot_roborecover.analysis.media import find_media
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.datasets.load import HUB_ID
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import write_whole

@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.logs import Arm
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.sequential import SequentialTest, grid_of, sequence, whole_units
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord

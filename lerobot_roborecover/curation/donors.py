@@ -25,7 +25,7 @@ from lerobot_roborecover.curation.attrition import StageCounts
 from lerobot_roborecover.curation.monitor_data.frames import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
 

@@ -18,7 +18,8 @@ from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions, read_actions
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log, trial_key
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow, trial_key
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of

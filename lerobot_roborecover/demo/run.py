@@ -14,7 +14,8 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo.evaluate import eval_command, evaluate
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.settings import DemoSettings, claim_folder
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials.progress import Tally
 

@@ -22,7 +22,8 @@ from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.real_time import RealTime
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions
-from lerobot_roborecover.env.trial_log import Protocol, RowLog, TrialLog, TrialRow, check_retry, trial_key
+from lerobot_roborecover.env.trial_log import RowLog, TrialLog, check_retry
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow, trial_key
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.robot_fingerprint import (
     NAME,

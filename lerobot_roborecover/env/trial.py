@@ -30,7 +30,7 @@ import numpy as np
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.intervention_record import InterventionRecord
 from lerobot_roborecover.env.real_time import MovingClock, RealTime
-from lerobot_roborecover.env.trial_log import Protocol, TrialRow, make_row, trial_key, trial_seed
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow, make_row, trial_key, trial_seed
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
 from lerobot_roborecover.workers.messages import (

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.env.trial import Trial, actions_digest
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_file
 

@@ -30,7 +30,7 @@ from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, Run, open_run, scenario_group
 from lerobot_roborecover.env.trial import Act, Trial, TrialState
-from lerobot_roborecover.env.trial_log import Protocol, trial_seed
+from lerobot_roborecover.env.trial_row import Protocol, trial_seed
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_log import Protocol, make_row
+from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms
 from lerobot_roborecover.study.definition import StudyDefinition

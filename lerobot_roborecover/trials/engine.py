@@ -19,7 +19,7 @@ from typing import Any
 from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, Trial
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.policies.host import PolicyAwayError, PolicyError, Replica, ReplicaLostError
 from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting

@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.intervals import rate_interval, spread
 from lerobot_roborecover.env.run import group_name
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 
 
 def eval_info(

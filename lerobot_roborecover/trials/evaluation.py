@@ -30,7 +30,7 @@ from lerobot_roborecover.env.identity import weights_identity
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.processors import env_processors
 from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lerobot_roborecover.analysis.sequential_record import record_path
-from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, read_log
+from lerobot_roborecover.env.trial_log import TrialLogError, read_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.whole import new_file
 
 

@@ -24,7 +24,8 @@ from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
-from lerobot_roborecover.env.trial_log import TrialRow, check_retry
+from lerobot_roborecover.env.trial_log import check_retry
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host

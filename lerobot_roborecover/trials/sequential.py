@@ -23,7 +23,8 @@ from lerobot_roborecover.analysis.sequential_record import SequentialRecord, rea
 from lerobot_roborecover.analysis.units import default_unit, unit_labels
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_log import Protocol, TrialRow, read_log
+from lerobot_roborecover.env.trial_log import read_log
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.trials.progress import Tally
 

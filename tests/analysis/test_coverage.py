@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.compare import compare
 from lerobot_roborecover.analysis.contrasts import holm
 from lerobot_roborecover.analysis.crossfit import gain_over, oracle, profile_difference
 from lerobot_roborecover.analysis.intervals import difference_interval, rate_interval, spread
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.logs import Arm, read_study
+from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.permutation import sign_flip_p
 from lerobot_roborecover.analysis.report_tables import overall

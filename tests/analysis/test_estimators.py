@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.contrasts import contrasts, contributions
 from lerobot_roborecover.analysis.costs import intervention_cost
 from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
@@ -22,7 +23,6 @@ from lerobot_roborecover.analysis.groups import (
     percentile_macro,
     source_matrix,
 )
-from lerobot_roborecover.analysis.logs import Arm
 from lerobot_roborecover.analysis.monitor import METRICS, metric_columns
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.ranking import rank_agreement

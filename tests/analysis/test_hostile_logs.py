@@ -20,7 +20,8 @@ from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.env.trial_check import _CHECKS, FieldProblem, RowChecker, parse_json
-from lerobot_roborecover.env.trial_log import TrialLogError, TrialRow, make_row, read_log, read_trial_log
+from lerobot_roborecover.env.trial_log import TrialLogError, read_log, read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow, make_row
 from lerobot_roborecover.trials.merge import merge
 from tests.support.trial_rows import trial_row, write_log
 
@@ -160,7 +161,8 @@ def test_options_that_only_look_alike_stay_apart(tmp_path):
 
 
 def test_what_an_error_message_holds_cannot_make_a_row_unreadable(tmp_path):
-    from lerobot_roborecover.env.trial_log import Protocol, TrialLog
+    from lerobot_roborecover.env.trial_log import TrialLog
+    from lerobot_roborecover.env.trial_row import Protocol
     from lerobot_roborecover.scenario import Outcome
     from tests.support.factories import fake_scenario
 

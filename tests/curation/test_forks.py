@@ -15,7 +15,8 @@ from lerobot_roborecover.curation.forks.trial import Fork, ForkTrial, LeadHost
 from lerobot_roborecover.env.recovery_env import RecoveryEnv
 from lerobot_roborecover.env.trial import actions_digest
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.env.trial_log import Protocol, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import Protocol
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.replay import hand_off
 from lerobot_roborecover.rewind import Trail

@@ -23,7 +23,8 @@ from lerobot_roborecover.demo.evaluate import eval_command
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.run import run_demo, spread
 from lerobot_roborecover.demo.settings import DemoSettings, claim_folder
-from lerobot_roborecover.env.trial_log import Protocol, make_row, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.rounding import policy_kernels
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
@@ -37,7 +38,8 @@ import os
 import sys
 from pathlib import Path
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_log import Protocol, TrialLog, make_row
+from lerobot_roborecover.env.trial_log import TrialLog
+from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.scenario import Outcome
 
 fail_after = int(sys.argv[1])

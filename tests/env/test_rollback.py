@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lerobot_roborecover.env.directives import BY_RULE, WIDTH, Controller, Directive, attach, split
 from lerobot_roborecover.env.intervention_record import InterventionRecord
 from lerobot_roborecover.env.recovery_env import RecoveryEnv
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import Outcome
 from tests.support.factories import fake_dataset, fake_scenario

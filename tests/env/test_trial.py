@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.env.directives import Controller, Directive
 from lerobot_roborecover.env.trial import SOLVED_THERE, Act, GoBack, Trial, TrialState
-from lerobot_roborecover.env.trial_log import Protocol
+from lerobot_roborecover.env.trial_row import Protocol
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.workers.messages import (

@@ -7,14 +7,8 @@ from dataclasses import asdict
 
 import pytest
 
-from lerobot_roborecover.env.trial_log import (
-    Protocol,
-    TrialLog,
-    TrialLogError,
-    make_row,
-    read_trial_log,
-    trial_seed,
-)
+from lerobot_roborecover.env.trial_log import TrialLog, TrialLogError, read_trial_log
+from lerobot_roborecover.env.trial_row import Protocol, make_row, trial_seed
 from lerobot_roborecover.scenario import Outcome
 from tests.support.factories import fake_dataset, fake_scenario
 from tests.support.loop import evaluate

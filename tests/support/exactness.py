@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.rounding import CORE_TYPE, core_type_in_use
 from lerobot_roborecover.scenario import Scenario

@@ -11,7 +11,8 @@ from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
 from lerobot_roborecover.env.options import RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.env.vector_env import create_recovery_envs
 from lerobot_roborecover.workers.messages import SlotConfig
 

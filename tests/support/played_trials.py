@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.env.trial import actions_digest
-from lerobot_roborecover.env.trial_log import Protocol, make_row
+from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.platforms.walk import advance
 from lerobot_roborecover.replay import Handoff

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.env.trial_log import TRIAL_SCHEMA, TrialRow
+from lerobot_roborecover.env.trial_check import TRIAL_SCHEMA
+from lerobot_roborecover.env.trial_row import TrialRow
 
 CELLS = [
     ("Approach", "Wrong Pose"),

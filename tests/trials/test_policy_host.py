@@ -11,7 +11,8 @@ import pytest
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, open_run
-from lerobot_roborecover.env.trial_log import read_trial_log, trial_seed
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import trial_seed
 from lerobot_roborecover.env.vector_env import create_recovery_envs
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.policies.host import PolicyError

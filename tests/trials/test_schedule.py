@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.env.trial_log import Protocol
+from lerobot_roborecover.env.trial_row import Protocol
 from lerobot_roborecover.policies.host import InlineReplica
 from lerobot_roborecover.trials.engine import Engine, units_of
 from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores

@@ -12,7 +12,7 @@ from lerobot_roborecover.curation.collect.server import Driven
 from lerobot_roborecover.curation.collect.starts import Planned
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import FAILURES, Trial
-from lerobot_roborecover.env.trial_log import Protocol, TrialRow
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow
 from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.units import Unit, UnitQueue

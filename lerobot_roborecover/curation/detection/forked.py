@@ -16,7 +16,8 @@ from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
 from lerobot_roborecover.scenario import ScenarioError
 

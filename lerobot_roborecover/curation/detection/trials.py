@@ -20,7 +20,7 @@ import numpy as np
 from lerobot_roborecover.curation.monitor_data.frames import RenderJob, replayed
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, run_trials
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import Outcome, Scenario
 from lerobot_roborecover.whole import new_file

@@ -11,7 +11,8 @@ import numpy as np
 
 from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
 
 OF = ("all", "failures", "successes")

@@ -21,7 +21,7 @@ from lerobot_roborecover.curation.forks.trial import Fork, ForkRun, LeadHost
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, env_config
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import Run, open_run
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.host import Host
 from lerobot_roborecover.scenario import ScenarioError

@@ -23,7 +23,7 @@ from lerobot_roborecover.curation.forks.parents import LoggedTrial
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, GoBack, StartsTrials, Trial
-from lerobot_roborecover.env.trial_log import Protocol, trial_seed
+from lerobot_roborecover.env.trial_row import Protocol, trial_seed
 from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
 from lerobot_roborecover.scenario import Start, TrialStart
 from lerobot_roborecover.workers.messages import EpisodeSpec

@@ -29,7 +29,7 @@ from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios, read_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import check_new
 from lerobot_roborecover.words import counted, next_line

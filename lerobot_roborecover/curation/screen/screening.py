@@ -22,7 +22,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.attrition import Decision
 from lerobot_roborecover.curation.validate.validation import ValidationRule
-from lerobot_roborecover.env.trial_log import TrialRow
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
 KEEP = ("0.1", "0.9")

@@ -14,7 +14,8 @@ from lerobot_roborecover.analysis.fork_gain import note_of
 from lerobot_roborecover.curation.monitor_data.choice import from_rollouts
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.env.trial_log import TrialRow, read_trial_log
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, Scenario
 
