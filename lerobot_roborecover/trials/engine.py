@@ -12,7 +12,6 @@ parts the engine is given: this process and its children (`local`), or a cluster
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
@@ -22,6 +21,7 @@ from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.policies.host import PolicyAwayError, PolicyError, Replica, ReplicaLostError
 from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
+from lerobot_roborecover.trials.company import Company
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
@@ -30,10 +30,6 @@ from lerobot_roborecover.workers.slots import MOST_LOSSES
 
 PARK_AFTER = 3
 """Simulator failures of one scenario in a row after which its other trials are not tried."""
-PATIENCE = 0.5
-"""How long a waiting slot waits for company, in inferences. Where an inference takes as long for many as for
-few, a batch that begins before its company has come costs the company a whole inference."""
-_MOST_PATIENT_S = 0.25
 _POLL_S = 0.5
 """How often `stop` is asked at least."""
 
@@ -52,7 +48,7 @@ class Engine:
         replicas: the policies.
         wait: how to wait for slots and replicas.
         batch_delay_s: how long a waiting slot may wait for company before the policy is asked, at least;
-            where inferences are slow it is longer, see `PATIENCE`.
+            where inferences are slow it is longer, see `company`.
         on_row: called with every finished trial.
         videos: which trials to film, if any.
         queue_of: in which order units are handed out.
@@ -74,10 +70,10 @@ class Engine:
     ):
         self._clock, self._queue_of = clock, queue_of
         self._run, self._replicas, self._wait = run, list(replicas), wait
-        self._delay_s, self._on_row, self._videos = batch_delay_s, on_row, videos
+        self._on_row, self._videos = on_row, videos
         self._seats = [Seat(slot) for slot in slots]
         self._asked: dict[Replica, tuple[list[Sitting], float]] = {}
-        self._inference_s = {r: deque[float](maxlen=8) for r in self._replicas}
+        self._company = {r: Company(batch_delay_s) for r in self._replicas}
         self._failures: dict[str, int] = {}
         self._losses: dict[tuple[str, int], int] = {}
         self._queue = UnitQueue(())
@@ -145,19 +141,11 @@ class Engine:
 
     def _ask(self, replica: Replica) -> bool:
         """Asks a free replica about the trials that wait for it, unless more company is to be expected."""
-        if replica.opening or replica in self._asked:
+        at = self._ask_at(replica)
+        if at is None or self._clock() < at:
             return False
-        mine = [s for s in self._sittings() if s.replica is replica]
-        waiting = [s for s in mine if s.waiting]
-        if not waiting:
-            return False
-        limit = replica.host.max_batch
-        company = any(s.working for s in mine)
-        enough = len(waiting) >= min(limit, max(len(mine) // 2, 1))
-        overdue = self._clock() - min(s.waiting_since for s in waiting) >= self._delay(replica)
-        if company and not enough and not overdue:
-            return False
-        asking = sorted(waiting, key=lambda s: s.waiting_since)[:limit]
+        waiting = [s for s in self._sittings() if s.replica is replica and s.waiting]
+        asking = sorted(waiting, key=lambda s: s.waiting_since)[: replica.host.max_batch]
         self._asked[replica] = asking, self._clock()
         replica.ask(
             [s.trial.ask() for s in asking],
@@ -166,11 +154,17 @@ class Engine:
         )
         return True
 
-    def _delay(self, replica: Replica) -> float:
-        """How long its slots wait for company."""
-        # The shortest of the last inferences: the first ones compile.
-        usual_s = min(self._inference_s[replica], default=0.0)
-        return max(self._delay_s, min(PATIENCE * usual_s, _MOST_PATIENT_S))
+    def _ask_at(self, replica: Replica) -> float | None:
+        """When a replica is to be asked; None where nobody waits for it, or it cannot be asked."""
+        if replica.opening or replica in self._asked:
+            return None
+        mine = [s for s in self._sittings() if s.replica is replica]
+        waiting = [s.waiting_since for s in mine if s.waiting]
+        if not waiting:
+            return None
+        acting = [s.answered_at for s in mine if s.working and s.answered_at is not None]
+        handing_off = sum(s.working and s.answered_at is None for s in mine)
+        return self._company[replica].ask_at(waiting, acting, handing_off, replica.host.max_batch)
 
     def _events(self) -> list[Event]:
         """What can happen next."""
@@ -206,10 +200,9 @@ class Engine:
         now = self._clock()
         deadline = min(getattr(party, "deadline", float("inf")) for party, _ in events)
         timeout_s = min(timeout_s, deadline - now)
-        for sitting in self._sittings():
-            replica = sitting.replica
-            if sitting.waiting and replica is not None and replica not in self._asked:
-                timeout_s = min(timeout_s, self._delay(replica) - (now - sitting.waiting_since))
+        for replica in self._replicas:
+            if (at := self._ask_at(replica)) is not None:
+                timeout_s = min(timeout_s, at - now)
         ready = set(map(id, self._wait([p.ready for p, _ in events], max(timeout_s, 0.0))))
         now = self._clock()
         return [
@@ -230,7 +223,7 @@ class Engine:
                         self._lost(sitting, str(err))
             return
         seconds = self._clock() - began
-        self._inference_s[replica].append(seconds)
+        self._company[replica].inferred(len(asked), seconds)
         for sitting, chunk in zip(asked, chunks, strict=True):
             trial, slot = sitting.trial, sitting.seat.slot
             if isinstance(chunk, PolicyAwayError):
@@ -241,6 +234,7 @@ class Engine:
             else:
                 actions, directives = split(chunk, self._run.action_width(sitting.unit.scenario))
                 move = trial.decide(actions, directives, seconds=seconds)
+                sitting.answered_at, sitting.answered_with = self._clock(), len(asked)
                 if isinstance(move, Act):
                     slot.send("act", move.actions)
                 elif move is not None:
@@ -257,6 +251,8 @@ class Engine:
         if isinstance(reply, SlotFailure) and reply.kind == "lost":
             self._lost(sitting, reply.message)
             return
+        if isinstance(reply, ActResult) and not reply.over:
+            self._company[sitting.replica].simulated(sitting.answered_with, reply.seconds)
         sitting.trial.take(reply)
         if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
             sitting.recording = self._videos.begin(sitting.unit, reply.frame, reply.hz)

@@ -61,6 +61,10 @@ class Sitting:
     """Who has the trial's history; None once that is lost."""
     history: Any
     waiting_since: float = 0.0
+    answered_at: float | None = None
+    """When the policy last answered, on the engine's clock; None before the first time."""
+    answered_with: int = 0
+    """Trials that were answered then."""
     recording: VideoWriter | None = None
 
     @property

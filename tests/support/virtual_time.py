@@ -6,6 +6,7 @@ Simulators share `cores`: where more of them work than there are cores, all slow
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class World:
             self.core_s += (moment - self.now) * speed * len(self.working)
             for slot in self.working:
                 slot.left_s -= (moment - self.now) * speed
+                slot.taken_s += moment - self.now
             self.working = [s for s in self.working if ends[s] > moment]
             self.now = moment
 
@@ -65,7 +67,7 @@ class VirtualSlot:
         self._reply: Any = None
         self._spec: EpisodeSpec | None = None
         self._steps = 0
-        self.left_s = 0.0
+        self.left_s = self.taken_s = 0.0
 
     @property
     def ready(self) -> Any:
@@ -86,11 +88,14 @@ class VirtualSlot:
             self._reply = ActResult({}, steps, False, over, 0.0)
         world = self._world
         takes_s = steps * world.step_s + world.look_s
+        self.taken_s = 0.0
         self.left_s = takes_s * max(1 + world.jitter * world.rng.standard_normal(), 0.1)
         world.working.append(self)
 
     def receive(self) -> Any:
         """The reply."""
+        if isinstance(self._reply, ActResult):
+            return replace(self._reply, seconds=self.taken_s)
         return self._reply
 
 

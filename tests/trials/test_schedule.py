@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial_row import Protocol
 from lerobot_roborecover.policies.host import InlineReplica
+from lerobot_roborecover.trials.company import Company
 from lerobot_roborecover.trials.engine import Engine, units_of
 from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
 from tests.support.factories import fake_scenario
@@ -20,10 +23,20 @@ STEP_S = 0.011
 CHUNK = 10
 
 
-def schedule(slots: int, cores: int, fixed_s: float, each_s: float = 0.0, shortest: int = 100):
-    """Twelve trials per slot, horizons from `shortest` to 100; the world and the policy afterwards."""
+def schedule(
+    slots: int,
+    cores: int,
+    fixed_s: float,
+    each_s: float = 0.0,
+    shortest: int = 100,
+    *,
+    chunk: int = CHUNK,
+    trials: int = 12,
+    limit: int = 64,
+):
+    """Trials of every slot, horizons from `shortest` to 100; the world and the policy afterwards."""
     world = World(cores, STEP_S, jitter=0.03)
-    host = VirtualHost(world, fixed_s, each_s, CHUNK)
+    host = VirtualHost(world, fixed_s, each_s, chunk, limit)
     rng, base = np.random.default_rng(0), fake_scenario(0)
     scenarios = [
         replace(
@@ -32,10 +45,10 @@ def schedule(slots: int, cores: int, fixed_s: float, each_s: float = 0.0, shorte
         )
         for k in range(slots)
     ]  # fmt: skip
-    run = Run(None, Protocol("recovery", 0, "p", 0, CHUNK), None, "d", None)
+    run = Run(None, Protocol("recovery", 0, "p", 0, chunk), None, "d", None)
     seats = [VirtualSlot(world) for _ in range(slots)]
     engine = Engine(run, seats, [InlineReplica(host)], world.wait, clock=world.clock)
-    assert engine.run(units_of(scenarios, 12)) == slots * 12
+    assert engine.run(units_of(scenarios, trials)) == slots * trials
     return world, host
 
 
@@ -72,16 +85,69 @@ def test_a_fast_policy_is_not_waited_for():
     assert world.now < 1.1 * (world.core_s / 8 + 12 * CHUNK * 0.010)
 
 
+@pytest.mark.parametrize(
+    ("fixed_s", "each_s", "limit"), [(0.1, 0.0, 64), (0.07, 0.005, 64), (0.07, 0.005, 16)]
+)
+def test_where_an_inference_costs_more_than_simulation_all_are_asked_about_together(fixed_s, each_s, limit):
+    world, host = schedule(16, 16, fixed_s, each_s, chunk=1, trials=2, limit=limit)
+    rounds = sum(host.batches) / 16
+    together = rounds * (STEP_S + fixed_s + 16 * each_s)
+    assert world.now < 1.1 * together
+    assert together < 0.8 * rounds * 2 * (fixed_s + 8 * each_s), "two halves that take turns"
+
+
+def test_a_batch_that_cannot_hold_all_is_not_waited_for_longer():
+    """Four of sixteen at a time: an inference begins as soon as four wait."""
+    world, host = schedule(16, 16, 0.1, chunk=1, trials=2, limit=4)
+    assert np.mean(host.batches) > 3.9
+    assert host.busy_s > 0.98 * world.now
+
+
+def _company(fixed_s: float, each_s: float, simulation_s: float) -> Company:
+    """One that has seen inferences for four and for eight of eight."""
+    company = Company(0.01)
+    for batch in (4, 8, 4, 8):
+        company.inferred(batch, fixed_s + batch * each_s)
+        company.simulated(8, simulation_s)
+    return company
+
+
+@given(
+    st.floats(0.001, 2), st.floats(0, 0.2), st.floats(0.001, 4), st.integers(1, 7),
+)  # fmt: skip
+def test_company_is_waited_for_where_an_inference_costs_more_than_it(fixed_s, each_s, simulation_s, waiting):
+    assume(abs(fixed_s - simulation_s) > 1e-3 * fixed_s)
+    company = _company(fixed_s, each_s, simulation_s)
+    at = company.ask_at([10.0] * waiting, [10.0] * (8 - waiting), 0, 64)
+    if simulation_s < fixed_s:
+        assert at == pytest.approx(10 + simulation_s)
+    else:
+        assert at == (10.0 if waiting >= 4 else 10 + company.delay_s)
+
+
+def test_a_simulator_that_hangs_is_not_waited_for():
+    company = _company(1.0, 0.0, 0.5)
+    assert company.ask_at([30.0] * 7, [10.0], 0, 64) == pytest.approx(10.5), "long ago"
+    assert company.ask_at([30.0] * 7, [], 1, 64) == 30, "nor one that rebuilds a start"
+
+
+def test_before_batches_differ_all_are_asked_about_together_once():
+    company = Company(0.01)
+    for _ in range(3):
+        company.inferred(4, 1.0)
+        company.simulated(4, 0.2)
+    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == pytest.approx(10.4), "the cores may be shared"
+    for _ in range(2):
+        company.inferred(8, 1.9)  # an observation more is what costs
+    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == 10
+
+
 def test_the_first_inference_which_compiles_makes_nobody_patient():
-    world = World(4, STEP_S)
-    host = VirtualHost(world, 0.01, chunk=CHUNK)
-    run = Run(None, Protocol("recovery", 0, "p", 0, CHUNK), None, "d", None)
-    replica = InlineReplica(host)
-    engine = Engine(run, [VirtualSlot(world)], [replica], world.wait, clock=world.clock)
-    engine._inference_s[replica].append(60.0)
-    assert engine._delay(replica) <= 0.25
-    engine._inference_s[replica].append(0.01)
-    assert engine._delay(replica) == pytest.approx(0.01)
+    company = Company(0.01)
+    company.inferred(1, 60.0)
+    assert company.delay_s <= 0.25
+    company.inferred(1, 0.01)
+    assert company.delay_s == pytest.approx(0.01)
 
 
 def test_default_slots_follow_cores_memory_and_the_policys_device(tmp_path):
