@@ -28,7 +28,7 @@ class Company:
     """Of one replica of the policy.
 
     Args:
-        least_s: how long a waiting trial may wait for company at least, where halves take turns.
+        least_s: how long a waiting trial may wait for company at least.
     """
 
     def __init__(self, least_s: float):
@@ -66,7 +66,7 @@ class Company:
         if acting and limit >= everybody:
             round_s = self._simulation_s(everybody)
             if round_s is not None and round_s <= self._fixed_s():
-                return max(acting) + round_s
+                return max(acting) + round_s + self._least_s  # what a reply takes on its way, too
         if len(waiting) >= min(limit, max((everybody + handing_off) // 2, 1)):
             return first
         return first + self.delay_s

@@ -120,14 +120,14 @@ def test_company_is_waited_for_where_an_inference_costs_more_than_it(fixed_s, ea
     company = _company(fixed_s, each_s, simulation_s)
     at = company.ask_at([10.0] * waiting, [10.0] * (8 - waiting), 0, 64)
     if simulation_s < fixed_s:
-        assert at == pytest.approx(10 + simulation_s)
+        assert at == pytest.approx(10 + simulation_s + 0.01)
     else:
         assert at == (10.0 if waiting >= 4 else 10 + company.delay_s)
 
 
 def test_a_simulator_that_hangs_is_not_waited_for():
     company = _company(1.0, 0.0, 0.5)
-    assert company.ask_at([30.0] * 7, [10.0], 0, 64) == pytest.approx(10.5), "long ago"
+    assert company.ask_at([30.0] * 7, [10.0], 0, 64) == pytest.approx(10.51), "long ago"
     assert company.ask_at([30.0] * 7, [], 1, 64) == 30, "nor one that rebuilds a start"
 
 
@@ -136,7 +136,7 @@ def test_before_batches_differ_all_are_asked_about_together_once():
     for _ in range(3):
         company.inferred(4, 1.0)
         company.simulated(4, 0.2)
-    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == pytest.approx(10.4), "the cores may be shared"
+    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == pytest.approx(10.41), "the cores may be shared"
     for _ in range(2):
         company.inferred(8, 1.9)  # an observation more is what costs
     assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == 10
