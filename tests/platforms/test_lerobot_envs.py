@@ -326,7 +326,8 @@ def test_a_moving_branch_of_the_hub_is_refused():
 
 @pytest.mark.lerobot
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pusht", pytest.param("aloha", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["pusht", "aloha"])
 def test_the_whole_chain(name, tmp_path):
     program = [sys.executable, "-m", "tests.support.outside_chain", str(tmp_path), name]
     done = subprocess.run(program, capture_output=True, text=True, cwd=Path(__file__).parents[2])

@@ -70,6 +70,7 @@ def test_a_score_that_is_reached_is_confirmed_after_an_interruption(reproduce, c
     assert len(read_trial_log(log)) == COUNT * TRIALS
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_score_that_is_missed_stops_before_the_recovery_arm(reproduce, capsys):
     status, found, out = reproduce("--published", "95,92,97")
