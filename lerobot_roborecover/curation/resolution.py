@@ -7,6 +7,7 @@ annotators, and trajectories without consensus are removed. Here, with n votes o
 2. Stage and type each need more than n / 2 votes, counting those who discard as votes for none.
 3. The recovery point is the median of the steps marked, the lower of the two in the middle; more than n / 2
    votes must lie within the tolerance of it.
+4. Of candidates that were alike up to their recovery points, which are one scenario, the first stays.
 
 Votes of a discussion take the place of those of the round before, candidate by candidate.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -171,7 +172,27 @@ def resolve(candidates: CandidateSet, folder: Path, config: ResolutionConfig) ->
                 rounds = max(rounds, number)
     resolved = tuple(resolve_votes(c, [latest[c][n] for n in sorted(latest[c])], config) for c in queue)
     measured = agreement(blind, config.annotators, config.tolerance_steps)
-    return Resolution(resolved, tuple(measured), names, rounds)
+    return Resolution(_without_twins(candidates, resolved), tuple(measured), names, rounds)
+
+
+def _without_twins(candidates: CandidateSet, resolved: Sequence[Resolved]) -> tuple[Resolved, ...]:
+    """Drops those whose recovery point is an earlier one's: the same task, reset and actions up to it."""
+    first: dict[str, str] = {}
+    found = []
+    for r in resolved:
+        if (
+            r.outcome == "kept"
+            and (same := first.setdefault(_moment(candidates, r), r.candidate)) != r.candidate
+        ):
+            r = replace(r, outcome="dropped", reason="the same moment as another", detail=f"as {same}")
+        found.append(r)
+    return tuple(found)
+
+
+def _moment(candidates: CandidateSet, r: Resolved) -> str:
+    return candidates.scenario(
+        r.candidate, r.step or 0, Stage(r.stage), DeviationType(r.deviation), {}
+    ).sha256()
 
 
 def queued(candidates: CandidateSet) -> set[str]:

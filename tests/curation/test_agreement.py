@@ -193,6 +193,20 @@ def test_votes_become_a_scenario_dataset_that_replays(annotated, tmp_path):
     assert rows["annotate"].dropped == (("discarded: temporary", 1),)
 
 
+def test_candidates_alike_up_to_their_recovery_points_are_one_scenario(annotated, monkeypatch):
+    """One operator, or one expert before its disturbance, may drive alike twice."""
+    candidates, votes = read_candidates(annotated), votes_folder(annotated, None)
+    rollouts = candidates.scenario
+    alike = lambda id_, step, *more: replace(rollouts("ep-0000", min(step, here), *more), id=id_)  # noqa: E731
+    monkeypatch.setattr(type(candidates), "scenario", lambda self, *given: alike(*given))
+    here = 12  # where ep-0004 is marked, and until where the two are alike
+    kept, dropped = (resolve(candidates, votes, ResolutionConfig()).candidates[i] for i in (0, 4))
+    assert (kept.outcome, dropped.outcome) == ("kept", "dropped")
+    assert (dropped.reason, dropped.detail) == ("the same moment as another", "as ep-0000")
+    here = 21  # ep-0000 is marked later in the same rollout: another moment
+    assert resolve(candidates, votes, ResolutionConfig()).counts()["kept"] == 2
+
+
 def test_decisions_are_read_once_however_many_candidates_there_are(annotated, monkeypatch):
     """Reading them for each candidate took minutes of every build of 1,600."""
     candidates = read_candidates(annotated)
