@@ -61,7 +61,7 @@ class Company:
             A time that is past where nobody is worth waiting for.
         """
         first, everybody = min(waiting), len(waiting) + len(acting)
-        if len(waiting) >= limit or everybody + handing_off == len(waiting):
+        if len(waiting) >= limit or not (acting or handing_off):
             return first
         if acting and limit >= everybody:
             round_s = self._simulation_s(everybody)

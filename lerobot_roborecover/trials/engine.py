@@ -113,6 +113,9 @@ class Engine:
         """The trials under way, in the order of their seats."""
         return [s.sitting for s in self._seats if s.sitting is not None]
 
+    def _sittings_of(self, replica: Replica) -> list[Sitting]:
+        return [s for s in self._sittings() if s.replica is replica]
+
     # --- events
 
     def _fill(self) -> None:
@@ -144,7 +147,7 @@ class Engine:
         at = self._ask_at(replica)
         if at is None or self._clock() < at:
             return False
-        waiting = [s for s in self._sittings() if s.replica is replica and s.waiting]
+        waiting = [s for s in self._sittings_of(replica) if s.waiting]
         asking = sorted(waiting, key=lambda s: s.waiting_since)[: replica.host.max_batch]
         self._asked[replica] = asking, self._clock()
         replica.ask(
@@ -158,7 +161,7 @@ class Engine:
         """When a replica is to be asked; None where nobody waits for it, or it cannot be asked."""
         if replica.opening or replica in self._asked:
             return None
-        mine = [s for s in self._sittings() if s.replica is replica]
+        mine = self._sittings_of(replica)
         waiting = [s.waiting_since for s in mine if s.waiting]
         if not waiting:
             return None
@@ -216,11 +219,10 @@ class Engine:
         try:
             chunks = replica.answer()
         except ReplicaLostError as err:
-            for sitting in self._sittings():
-                if sitting.replica is replica:
-                    sitting.replica = None
-                    if not sitting.working:  # one that works is given up when its slot has replied
-                        self._lost(sitting, str(err))
+            for sitting in self._sittings_of(replica):
+                sitting.replica = None
+                if not sitting.working:  # one that works is given up when its slot has replied
+                    self._lost(sitting, str(err))
             return
         seconds = self._clock() - began
         self._company[replica].inferred(len(asked), seconds)
