@@ -97,9 +97,8 @@ class SteppingIn:
             return made
         donors, base = self.out / "donors", self.subject.base
         if not (donors / "meta" / "roborecover" / "donors.json").exists():
-            shutil.rmtree(
-                donors, ignore_errors=True
-            )  # of a run that was cut short; its trials are kept beside it
+            # Of a run that was cut short; its trials are kept beside it.
+            shutil.rmtree(donors, ignore_errors=True)
             logs = [self.trials("donors", policy) for policy in (base, *self.subject.donors)]
             named = [word for policy in self.subject.donors for word in ("--donor", str(policy))]
             roborecover(
