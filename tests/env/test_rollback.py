@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.env.directives import BY_RULE, WIDTH, Controller, Directive, attach, split
@@ -62,6 +63,8 @@ def states_along(env: RecoveryEnv, actions: np.ndarray) -> list[str]:
     exact=st.booleans(),
     again=st.integers(0, 6),
 )
+@example(taken=4, back=1, keep=3, exact=True, again=4)  # the second goes further than snapshots are kept
+@example(taken=20, back=3, keep=3, exact=True, again=0)
 def test_the_state_of_k_steps_ago_on_the_fake_simulator(taken, back, keep, exact, again):
     scenario = fake_scenario(1, steps=14, horizon=60)
     simulator = make_simulator("fake") if exact else InexactSimulator()
@@ -73,22 +76,29 @@ def test_the_state_of_k_steps_ago_on_the_fake_simulator(taken, back, keep, exact
         RecoveryEnv(scenario, "initial", simulator=make_simulator("fake")), scenario.prefix[2:]
     )
     all_states = prefix[:-1] + fresh  # after the two settling actions, the start of an initial-state trial
+    reached = len(prefix) - 1
+    # Where snapshots are from: before each of the last keep + 1 steps. What was undone has none.
+    kept = deque(maxlen=keep + 1 if exact and keep else 0)
     env.reset()
     for action in actions:
         env.advance(action)
-    reached = len(all_states) - 1
+        kept.append(reached)
+        reached += 1
     for k in (back, again):  # a second rollback continues from where the first one went
         result = env.rollback(k)
         assert result.distance == min(k, reached)
         reached -= result.distance
         assert env.simulator.state_sha256() == all_states[reached]
+        near = result.distance == 0 or reached - 1 in kept  # that step is taken again
+        assert result.method == ("snapshot" if near else "replay")
+        while kept and kept[-1] >= reached:
+            kept.pop()
         follow = rng.uniform(-1, 1, (again, 2))
         for action in follow:
             env.advance(action)
+            kept.append(reached)
             all_states[reached + 1 :] = [env.simulator.state_sha256()]
             reached += 1
-    if exact and 0 < back <= min(keep, taken - 1):
-        assert result.method == "snapshot" or again > taken
 
 
 @pytest.mark.metaworld
