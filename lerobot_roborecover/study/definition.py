@@ -1,8 +1,8 @@
 """What a study evaluates: `study.json` in a folder that holds scenarios, policies and stored outcomes.
 
 study.json       this file
-scenarios/       a scenario dataset
-policies/NAME/   checkpoints
+scenarios/       a scenario dataset, unless study.json names one that comes with the package
+policies/NAME/   checkpoints, unless study.json names a folder of the checkout that has them
 correction/      a checkpoint, optional
 monitor/         a checkpoint, optional
 outcomes.csv     what came of every trial, to compare with; optional
@@ -27,6 +27,9 @@ DEFAULT = "metaworld"
 """The study that is meant where none is named."""
 MAX_TRIALS = 1000
 
+IN_CHECKOUT = Path("policies/study")
+"""Studies too large for the package, whose policies are the checkout's."""
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
@@ -47,15 +50,19 @@ class StudyDefinition:
     """Modes of `roborecover_intervention`."""
     environment: Mapping[str, str] = field(default_factory=dict)
     """Variables that decide how policies round."""
+    dataset: str = ""
+    """Name of the scenario set, where it comes with the package."""
+    policies_folder: str = ""
+    """Of the policies, from the top of a checkout, where they are not the study's own."""
 
     @property
-    def scenarios(self) -> Path:
-        """The scenario dataset."""
-        return self.root / "scenarios"
+    def scenarios(self) -> str:
+        """The scenario dataset: a folder, or a name."""
+        return self.dataset or str(self.root / "scenarios")
 
     def policy(self, name: str) -> Path:
         """A policy's checkpoint."""
-        return self.root / "policies" / name
+        return (Path(self.policies_folder) if self.policies_folder else self.root / "policies") / name
 
     @property
     def correction(self) -> Path:
@@ -74,20 +81,21 @@ class StudyDefinition:
 
 
 def shipped_study(name: str = DEFAULT) -> Path:
-    """Folder of a study that comes with the package.
+    """Folder of a study that comes with the package, or with the checkout that one stands in.
 
     Raises:
-        ScenarioError: it does not.
+        ScenarioError: there is none.
     """
     data = Path(str(resources.files("lerobot_roborecover"))) / "data"
-    folder = data / f"{name}_study"
-    if not _NAME.fullmatch(name) or not folder.is_dir():
-        there = sorted(path.name.removesuffix("_study") for path in data.glob("*_study"))
+    paths = [*IN_CHECKOUT.glob(f"*/{DEFINITION_FILE}"), *data.glob(f"*_study/{DEFINITION_FILE}")]
+    folders = {path.parent.name.removesuffix("_study"): path.parent for path in paths}
+    if name not in folders:
         raise ScenarioError(
-            f"no study {name!r:.80} comes with the package; there are {', '.join(there)}. In a checkout of "
-            "the repository, --make makes those whose recipe is in policies/study"
+            f"no study {name!r:.80} comes with the package; there are {', '.join(sorted(folders))}. The top "
+            f"folder of a checkout of the repository has those of {IN_CHECKOUT} as well, and --make makes "
+            "them anew"
         )
-    return folder
+    return folders[name]
 
 
 def read_definition(root: Path) -> StudyDefinition:
@@ -131,6 +139,8 @@ def write_definition(study: StudyDefinition) -> Path:
         "split": study.split,
         "interventions": list(study.interventions),
         "environment": dict(study.environment),
+        **({"dataset": study.dataset} if study.dataset else {}),
+        **({"policies_folder": study.policies_folder} if study.policies_folder else {}),
     }
     path.write_text(json.dumps(found, indent=2) + "\n")
     return path
@@ -142,6 +152,9 @@ def _check(path: Path, study: StudyDefinition) -> None:
     def wrong(name: str, value: object, wanted: str) -> ScenarioError:
         return ScenarioError(f"{path}, field {name}: {value!r:.200}; it must be {wanted}")
 
+    for name in ("dataset", "policies_folder"):
+        if not isinstance(getattr(study, name), str):
+            raise wrong(name, getattr(study, name), "a text")
     if not isinstance(study.policies, dict) or not study.policies:
         raise wrong("policies", study.policies, "an object of policy names and trial counts")
     for name, trials in study.policies.items():
@@ -150,7 +163,10 @@ def _check(path: Path, study: StudyDefinition) -> None:
         if type(trials) is not int or not 1 <= trials <= MAX_TRIALS:
             raise wrong(f"policies.{name}", trials, f"a count from 1 to {MAX_TRIALS}")
         if not study.policy(name).is_dir():
-            raise ScenarioError(f"{path} names policy {name}, but {study.policy(name)} is not a folder")
+            where = ": run this in the top folder of a checkout" if study.policies_folder else ""
+            raise ScenarioError(
+                f"{path} names policy {name}, but {study.policy(name)} is not a folder{where}"
+            )
     if study.base not in study.policies:
         raise wrong("base", study.base, f"one of {sorted(study.policies)}")
     for mode in study.interventions:
@@ -165,5 +181,5 @@ def _check(path: Path, study: StudyDefinition) -> None:
         texts = getattr(study, name)
         if not isinstance(texts, dict) or not all(isinstance(v, str) for v in texts.values()):
             raise wrong(name, texts, "an object of texts")
-    if not study.scenarios.is_dir():
+    if not study.dataset and not Path(study.scenarios).is_dir():
         raise ScenarioError(f"{path}: {study.scenarios} is not a folder; it must hold the scenario dataset")

@@ -17,7 +17,9 @@ from pathlib import Path
 import yaml
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
+from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
 from lerobot_roborecover.journal import append_records
+from lerobot_roborecover.policies.ship import ship
 from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
@@ -207,19 +209,31 @@ def assemble(out: Path, recipe: StudyRecipe) -> StudyDefinition:
 
 def _assemble(out: Path, recipe: StudyRecipe, folder: Path) -> None:
     ignore = shutil.ignore_patterns("train_config.json", "videos", "images", "*.html")
-    for name in recipe.policies:
+    for name in () if recipe.policies_folder else recipe.policies:
         shutil.copytree(recipe.policy(out, name), folder / "policies" / name, ignore=ignore)
-    kept = Path("meta") / "roborecover"
-    shutil.copytree(out / "scenarios" / "split" / kept, folder / "scenarios" / kept, ignore=ignore)
-    shutil.copytree(out / "correction", folder / "correction", ignore=ignore)
+    split, kept = out / "scenarios" / "split", Path("meta") / "roborecover"
+    with_package = comes_with_the_package(split, recipe.dataset)
+    if not with_package:
+        shutil.copytree(split / kept, folder / "scenarios" / kept, ignore=ignore)
+    ship(out / "correction", folder / "correction")
     shutil.copytree(out / "monitor_training" / _CHECKPOINT, folder / "monitor", ignore=ignore)
     for path in (*folder.glob("*/config.json"), *folder.glob("policies/*/config.json")):
         _forget_place(path)
     study = StudyDefinition(
         root=folder, platform=recipe.platform, policies=recipe.policies, base=recipe.base, env=recipe.env,
         interventions=tuple(recipe.interventions), environment=KERNELS,
+        dataset=recipe.dataset if with_package else "",
+        policies_folder=recipe.policies_folder or "",
     )  # fmt: skip
     write_definition(study)
+
+
+def comes_with_the_package(made: Path, name: str) -> bool:
+    """Whether the scenarios that were made, and their splits, are those of a set of this name."""
+    if name not in builtin_names():
+        return False
+    ours, theirs = ({(s.sha256(), s.split) for s in load_scenarios(of)} for of in (made, name))
+    return ours == theirs
 
 
 def _forget_place(path: Path) -> None:

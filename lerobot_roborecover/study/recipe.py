@@ -8,8 +8,9 @@ from pathlib import Path
 from lerobot_roborecover.curation.pipeline.config import read_options
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.study.definition import IN_CHECKOUT
 
-RECIPES = Path("policies/study")
+RECIPES = IN_CHECKOUT
 
 
 @dataclass
@@ -25,6 +26,8 @@ class StudyRecipe:
     """The scenarios' recipe."""
     chain_root: str
     """The folder that it works in unless told otherwise."""
+    dataset: str = ""
+    """Name of the set that comes with the package, which the study names where its scenarios are the same."""
     env: dict[str, str] = field(default_factory=dict)
     """Options of the recovery env type."""
     interventions: list[str] = field(default_factory=list)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
-from lerobot_roborecover.study.definition import read_definition
+from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition
 from lerobot_roborecover.study.evaluate import compare_with_stored
-from lerobot_roborecover.study.make import chain_for, stages
+from lerobot_roborecover.study.make import chain_for, comes_with_the_package, stages
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
 from lerobot_roborecover.study.recipe import read_recipe
 from tests.support.factories import fake_dataset, save_policy
@@ -141,6 +143,8 @@ def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, m
         ({"interventions": ["human"]}, "field interventions: 'human'"),
         ({"interventions": ["correction"]}, "mode correction needs a correction"),
         ({"env": {"obs_type": 3}}, "field env"),
+        ({"dataset": 3}, "field dataset: 3; it must be a text"),
+        ({"policies_folder": "policies/none"}, "run this in the top folder of a checkout"),
         ({"colour": "red"}, "not a study's definition"),
     ],
 )  # fmt: skip
@@ -220,14 +224,45 @@ def test_a_recipe_that_makes_no_sense_is_refused(tmp_path, monkeypatch, text, sa
 
 def test_a_study_that_does_not_ship_is_named(capsys):
     assert main(["study", "--name", "robotwin"]) == 2
-    assert "no study 'robotwin' comes with the package; there are metaworld" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no study 'robotwin' comes with the package; there are" in said
+    assert "metaworld" in said
+
+
+def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(study, tmp_path, monkeypatch):
+    checkout = tmp_path / "checkout"
+    shutil.copytree(study / "policies", checkout / "policies" / "fake")
+    where = checkout / "policies" / "study" / "mine"
+    where.mkdir(parents=True)
+    define(where, dataset="metaworld_starter", policies_folder="policies/fake")
+    monkeypatch.chdir(checkout)
+    found = read_definition(shipped_study("mine"))
+    write_definition(found)
+    assert read_definition(found.root) == found
+    run = next(iter(arms(found, tmp_path / "out"))).run.command_line()
+    assert "--env.scenarios=metaworld_starter" in run
+    assert "--policy.path=policies/fake/act" in run
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ScenarioError, match="no study 'mine'"):
+        shipped_study("mine")
+
+
+def test_a_study_names_a_set_of_the_package_where_its_scenarios_are_the_same(tmp_path):
+    shipped = load_scenarios("metaworld_starter")
+    same, other = tmp_path / "same", tmp_path / "other"
+    write_scenarios(same, list(shipped)[::-1], description="in another order")
+    changed = replace(shipped[0], split="train" if shipped[0].split == "test" else "test")
+    write_scenarios(other, [changed, *shipped[1:]], description="another split")
+    assert comes_with_the_package(same, "metaworld_starter")
+    assert not comes_with_the_package(other, "metaworld_starter")
+    assert not comes_with_the_package(same, "")
 
 
 def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
     recipe = read_recipe("metaworld")
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
     assert [s.name for s in found] == [
-        "policies", "driven1", "driven2", "scenarios", "donors", "correction", "monitor data", "monitor",
+        "policies", *recipe.recordings, "scenarios", "donors", "correction", "monitor data", "monitor",
         "monitor metrics",
     ]  # fmt: skip
     assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
