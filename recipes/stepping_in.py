@@ -101,6 +101,7 @@ class SteppingIn:
             shutil.rmtree(donors, ignore_errors=True)
             logs = [self.trials("donors", policy) for policy in (base, *self.subject.donors)]
             named = [word for policy in self.subject.donors for word in ("--donor", str(policy))]
+            named += [word for policy in self.subject.donors for word in ("--deterministic", str(policy))]
             roborecover(
                 "donors", *logs, "--scenarios", self.subject.scenarios, "--base", base, *named,
                 "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,

@@ -36,6 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--base-below", type=float, default=0.4, help="the base's rate on a scenario (%(default)s)")
     add("--donor-above", type=float, default=0.6, help="an alternative's rate on it (%(default)s)")
     add("--trials", type=int, default=4, help="of each candidate (%(default)s)")
+    add(
+        "--deterministic", action="append", default=[], metavar="CHECKPOINT",
+        help="this --donor does the same in every trial: one is run of each candidate, and counts as all",
+    )  # fmt: skip
     add("--successes", type=int, default=3, help="of these, at least (%(default)s)")
     add("--per-record", type=int, default=1, help="trajectories per source record (%(default)s)")
     add("--run-seed", type=int, default=2000, help="of the donors' trials (%(default)s)")
@@ -68,15 +72,20 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.datasets.schema import FOLDER
     from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.env.options import OptionError
     from lerobot_roborecover.env.trial_log import read_trial_log
     from lerobot_roborecover.progress import Progress
     from lerobot_roborecover.scenario import ScenarioError
 
     if args.out.exists() and any(args.out.iterdir()):
         raise ScenarioError(f"{args.out} is not an empty folder")
+    stray = [checkpoint for checkpoint in args.deterministic if checkpoint not in args.donor]
+    if stray:
+        raise OptionError(f"--deterministic {' '.join(stray)}: not among the donors {', '.join(args.donor)}")
     options = donors.DonorOptions(
-        args.base_below, args.donor_above, args.trials, args.successes, args.per_record
-    )
+        args.base_below, args.donor_above, args.trials, args.successes, args.per_record,
+        tuple(policy_identity(checkpoint) for checkpoint in args.deterministic),
+    )  # fmt: skip
     scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
     rows = [row for log in args.logs for row in read_trial_log(log)]
     base = policy_identity(args.base) if args.base not in {r.policy for r in rows} else args.base
@@ -96,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         which += [f"--revision={args.revision}"] if args.revision else []
         env = env_config(scenarios.platform, args.scenarios, [*which, *(f"--{o}" for o in args.env)])
         trials += run_trials(
-            checkpoint, env, work / f"{number}-{name.replace('/', '--')}", trials=args.trials,
+            checkpoint, env, work / f"{number}-{name.replace('/', '--')}", trials=options.trials_of(name),
             seed=args.run_seed, device=args.device,
             on_row=lambda row, done, total: progress.of(f"trials of {row.policy}", done, total),
         )  # fmt: skip

@@ -4,7 +4,8 @@ As the paper has it ("Setup" of the interventions; appendix, "Correction Data an
 
 1. of the training scenarios, those that the base recovers in less than 40 % of its trials;
 2. the alternatives that recover one in more than 60 % of theirs are its candidates;
-3. four trials each; a candidate stays with at least three successes and every trial complete;
+3. four trials each; a candidate stays with at least three successes and every trial complete (one trial of a
+   policy that does the same in every trial counts as all);
 4. one trajectory per source record: the best candidate's first success;
 5. it is replayed, must succeed again, and its observations are rendered as it goes.
 
@@ -23,10 +24,11 @@ import numpy as np
 
 from lerobot_roborecover.curation.attrition import StageCounts
 from lerobot_roborecover.curation.monitor_data.frames import RenderedSteps, RenderJob, replayed
-from lerobot_roborecover.curation.policy_trials import PolicyTrial
+from lerobot_roborecover.curation.policy_trials import PolicyTrial, check_repeats
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
+from lerobot_roborecover.words import counted
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class DonorOptions:
     """Of these, at least."""
     per_record: int = 1
     """Different trajectories kept of one source record, at most."""
+    deterministic: tuple[str, ...] = ()
+    """Policies, as in the trial logs, that do the same in every trial: one counts as all."""
 
     def __post_init__(self):
         if not 0.0 <= self.base_below <= 1.0 or not 0.0 <= self.donor_above < 1.0:
@@ -54,6 +58,10 @@ class DonorOptions:
                 f"{self.successes} successes of {self.trials} trials, {self.per_record} per record: must be "
                 "at least 1, and no more successes than trials"
             )
+
+    def trials_of(self, policy: str) -> int:
+        """How many are run of a candidate."""
+        return 1 if policy in self.deterministic else self.trials
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,9 @@ def judge(
         trials: of the candidates' policies, with actions; others are ignored.
         options: thresholds.
         funnel: told.
+
+    Raises:
+        ScenarioError: two trials of a policy that is said to be deterministic differ.
     """
     of: dict[tuple[str, str], dict[int, PolicyTrial]] = defaultdict(dict)
     for trial in trials:
@@ -176,14 +187,17 @@ def judge(
     donors, dropped = [], Counter()
     for candidate in candidates:
         mine = of[candidate.scenario.sha256(), candidate.policy]
-        four = [mine[k] for k in sorted(mine)[: options.trials]]
+        wanted = options.trials_of(candidate.policy)
+        if candidate.policy in options.deterministic:
+            check_repeats(candidate.policy, [mine[k].row for k in sorted(mine)])
+        four = [mine[k] for k in sorted(mine)[:wanted]]
         complete = [t for t in four if Outcome(t.row.outcome).valid]
         donor = Donor(candidate, tuple(four))
-        if len(four) < options.trials:
-            dropped[f"with fewer than {options.trials} trials"] += 1
-        elif len(complete) < options.trials:
+        if len(four) < wanted:
+            dropped[f"with fewer than {counted(wanted, 'trial')}"] += 1
+        elif len(complete) < wanted:
             dropped["with a trial that did not complete"] += 1
-        elif len(donor.successes) < options.successes:
+        elif len(donor.successes) < min(options.successes, wanted):
             dropped[f"with fewer than {options.successes} successes in {options.trials}"] += 1
         else:
             donors.append(donor)
@@ -227,7 +241,13 @@ def deduplicate(
 
 def _preference(donor: Donor) -> tuple:
     c, won = donor.candidate, donor.successes
-    return (-len(won), -c.donor_rate, float(np.mean([t.row.steps for t in won])), c.policy, c.scenario.id)
+    return (
+        -len(won) / len(donor.trials),
+        -c.donor_rate,
+        float(np.mean([t.row.steps for t in won])),
+        c.policy,
+        c.scenario.id,
+    )
 
 
 def write_donors(

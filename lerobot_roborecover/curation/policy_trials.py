@@ -117,6 +117,21 @@ def run_trials(
     return [_with_actions(rows[key], folder / ACTIONS_FOLDER) for key in keys if key in rows]
 
 
+def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
+    """Checks that a policy which is said to be deterministic did the same in every trial of a scenario.
+
+    Raises:
+        ScenarioError: two trials differ.
+    """
+    for row in rows[1:]:
+        if (row.outcome, row.actions_sha256) != (rows[0].outcome, rows[0].actions_sha256):
+            raise ScenarioError(
+                f"{name} is said to be deterministic, but trials {rows[0].trial} and {row.trial} of "
+                f"{row.scenario_id} differ ({rows[0].outcome} after {rows[0].steps} steps, {row.outcome} "
+                f"after {row.steps}); leave out --deterministic {name}"
+            )
+
+
 def read_trials(folder: Path) -> list[PolicyTrial]:
     """Trials that `run_trials` left in a folder, whatever their protocol.
 

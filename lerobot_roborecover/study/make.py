@@ -76,6 +76,13 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
     ]  # fmt: skip
     logs += [str(base_trials / "trials.jsonl")] if of_base else []
     donors = [part for name in screening if name != recipe.base for part in ("--donor", policy(name))]
+    # One trial of it says all in the evaluation, and here.
+    donors += [
+        part
+        for name in screening
+        if name != recipe.base and recipe.policies[name] == 1
+        for part in ("--deterministic", policy(name))
+    ]
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(

@@ -131,6 +131,32 @@ def test_three_of_four_and_all_complete():
     }
 
 
+def test_one_trial_of_a_deterministic_policy_counts_as_all():
+    made = scenarios(4)
+    candidates = chosen_candidates(made)
+    a, b, c, d = made
+    options = DonorOptions(deterministic=(GOOD,))
+    assert (options.trials_of(GOOD), options.trials_of(FAIR)) == (1, 4)
+    trials = [trial(a, GOOD, 0), trial(b, GOOD, 0, False), trial(c, GOOD, 0, False, outcome="timeout")]
+    trials += [trial(a, FAIR, k, k != 2) for k in range(4)] + [trial(d, FAIR, 0)]
+    funnel = begun("candidates", 8)
+    passed = judge(candidates, trials, options, funnel)
+    assert {(p.candidate.scenario.id, p.candidate.policy) for p in passed} == {(a.id, GOOD), (a.id, FAIR)}
+    assert reasons(funnel) == {
+        "with fewer than 3 successes in 4": 1,
+        "with a trial that did not complete": 1,
+        "with fewer than 1 trial": 1,
+        "with fewer than 4 trials": 3,
+    }
+    ((donor, taken),) = deduplicate(passed, options, funnel)
+    assert (donor.candidate.policy, taken.row.trial) == (GOOD, 0), "one of one comes before three of four"
+    same = recovery(a)
+    repeats = [trial(a, GOOD, k, actions=same) for k in range(4)]
+    assert len(judge(candidates, repeats, options, begun("", 0))[0].trials) == 1
+    with pytest.raises(ScenarioError, match=f"{GOOD} is said to be deterministic, but trials 0 and 1"):
+        judge(candidates, [trial(a, GOOD, k) for k in range(2)], options, begun("", 0))
+
+
 def test_one_trajectory_per_source_record_and_none_twice():
     made = scenarios(4)
     candidates = chosen_candidates(made)

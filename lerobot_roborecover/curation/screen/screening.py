@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.curation.policy_trials import check_repeats
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
@@ -254,22 +255,11 @@ def tally(
             mine = of[name, scenario.id, scenario.sha256()]
             found, each_counts = [mine[trial] for trial in sorted(mine)], 1
             if name in deterministic and found:
-                found, each_counts = [_the_one(name, found)], rule.trials
+                check_repeats(name, found)
+                found, each_counts = found[:1], rule.trials
             counts[name] = _count(found, each_counts)
         result.append(Screened(scenario, counts, rule))
     return result
-
-
-def _the_one(name: str, rows: Sequence[TrialRow]) -> TrialRow:
-    """The trial that stands for all."""
-    for row in rows[1:]:
-        if (row.outcome, row.actions_sha256) != (rows[0].outcome, rows[0].actions_sha256):
-            raise ScenarioError(
-                f"{name} is said to be deterministic, but trials {rows[0].trial} and {row.trial} of "
-                f"{row.scenario_id} differ ({rows[0].outcome} after {rows[0].steps} steps, {row.outcome} "
-                f"after {row.steps}); leave out --deterministic {name}"
-            )
-    return rows[0]
 
 
 def _count(rows: Sequence[TrialRow], each_counts: int) -> PolicyCount:
