@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--trials", type=int, default=4, help="of each candidate (%(default)s)")
     add(
         "--deterministic", action="append", default=[], metavar="CHECKPOINT",
-        help="this --donor does the same in every trial: one is run of each candidate, and counts as all",
+        help="this alternative (or its name in the logs) does the same in every trial: one of each candidate "
+        "counts as all",
     )  # fmt: skip
     add("--successes", type=int, default=3, help="of these, at least (%(default)s)")
     add("--per-record", type=int, default=1, help="trajectories per source record (%(default)s)")
@@ -79,20 +80,25 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out.exists() and any(args.out.iterdir()):
         raise ScenarioError(f"{args.out} is not an empty folder")
-    stray = [checkpoint for checkpoint in args.deterministic if checkpoint not in args.donor]
+    rows = [row for log in args.logs for row in read_trial_log(log)]
+    names = {row.policy for row in rows}
+    base, *alike = (p if p in names else policy_identity(p) for p in (args.base, *args.deterministic))
+    trials = [t for folder in args.trials_from for t in read_trials(folder)]
+    given = {policy_identity(checkpoint) for checkpoint in args.donor} | {t.row.policy for t in trials}
+    stray = sorted(set(alike) - given)
     if stray:
-        raise OptionError(f"--deterministic {' '.join(stray)}: not among the donors {', '.join(args.donor)}")
+        raise OptionError(
+            f"--deterministic {' '.join(stray)}: neither a --donor, nor one whose trials are in "
+            f"--trials-from; these are {', '.join(sorted(given)) or 'none'}"
+        )
     options = donors.DonorOptions(
         args.base_below, args.donor_above, args.trials, args.successes, args.per_record,
-        tuple(policy_identity(checkpoint) for checkpoint in args.deterministic),
+        tuple(alike),
     )  # fmt: skip
     scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
-    rows = [row for log in args.logs for row in read_trial_log(log)]
-    base = policy_identity(args.base) if args.base not in {r.policy for r in rows} else args.base
     funnel: list[StageCounts] = []
     donors.add_step(funnel, f"scenarios of split {args.split}", len(scenarios))
     candidates = donors.choose_candidates(scenarios, rows, base, options, funnel)
-    trials = [t for folder in args.trials_from for t in read_trials(folder)]
     work = args.work or args.out.with_name(f"{args.out.name}.trials")
     progress = Progress("trial")
     for number, checkpoint in enumerate(args.donor):

@@ -75,14 +75,12 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         )
     ]  # fmt: skip
     logs += [str(base_trials / "trials.jsonl")] if of_base else []
-    donors = [part for name in screening if name != recipe.base for part in ("--donor", policy(name))]
-    # One trial of it says all in the evaluation, and here.
-    donors += [
-        part
-        for name in screening
-        if name != recipe.base and recipe.policies[name] == 1
-        for part in ("--deterministic", policy(name))
-    ]
+    donors: list[str] = []
+    for name in (n for n in screening if n != recipe.base):
+        # One trial says all of a policy that repeats itself, and screening has kept it.
+        once = recipe.policies[name] == 1
+        donors += ["--trials-from", str(trials / name), "--deterministic"] if once else ["--donor"]
+        donors.append(policy(name))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(

@@ -245,6 +245,20 @@ def test_the_command_reads_trials_and_shows_the_funnel(tmp_path, capsys):
     assert note["base"] == BASE
     assert [s["count"] for s in note["funnel"]] == [4, 4, 4, 4, 2, 2]
 
+    # One trial that was kept elsewhere is enough of who does the same in every trial.
+    one = recorded(tmp_path / "one", [trial(s, GOOD, 0) for s in made])
+    once = [*command, "--trials-from", str(one)]
+    assert main([*once, "--deterministic", GOOD, "--out", str(tmp_path / "once")]) == 0
+    assert "     4  donors" in capsys.readouterr().out
+    note = json.loads((tmp_path / "once" / "meta" / "roborecover" / "donors.json").read_text())
+    assert note["options"]["deterministic"] == [GOOD]
+    assert main([*once, "--out", str(tmp_path / "four")]) == 2
+    assert "4 with fewer than 4 trials" in capsys.readouterr().err
+    assert main([*once, "--deterministic", FAIR, "--out", str(tmp_path / "fair")]) == 2
+    assert f"neither a --donor, nor one whose trials are in --trials-from; these are {GOOD}" in (
+        capsys.readouterr().err
+    )
+
     # A log alone is no donor; nor is a folder that is used already.
     for file in (trials / ACTIONS_FOLDER).iterdir():
         file.unlink()

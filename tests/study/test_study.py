@@ -199,6 +199,9 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
     run, donors = found[names.index("base trials")].commands[0], found[names.index("donors")].commands[0]
     assert "--env.split=train" in run
     assert str(tmp_path / "base_trials" / "trials.jsonl") in donors
+    # All of its donors repeat themselves: what screening kept of them is enough.
+    assert "--donor" not in donors
+    assert donors.count("--deterministic") == donors.count("--trials-from") == len(chain.screen.policies)
 
 
 @pytest.mark.parametrize(
