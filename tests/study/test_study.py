@@ -17,9 +17,9 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
 from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition
 from lerobot_roborecover.study.evaluate import compare_with_stored
-from lerobot_roborecover.study.make import chain_for, comes_with_the_package, stages
+from lerobot_roborecover.study.make import assemble, chain_for, comes_with_the_package, stages
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
-from lerobot_roborecover.study.recipe import read_recipe
+from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
 from tests.support.factories import fake_dataset, save_policy
 
 COUNT = 4
@@ -248,6 +248,34 @@ def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(stud
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ScenarioError, match="no study 'mine'"):
         shipped_study("mine")
+
+
+@pytest.mark.lerobot
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_is_made_is_put_together_as_a_study(parts, tmp_path, elsewhere):
+    """Policies as they were screened, or where the checkout has them; Correction in half precision."""
+    from safetensors.torch import load_file
+
+    out, checkpoint = tmp_path / "out", parts / "policies" / "act"
+    fake_dataset(out / "scenarios" / "split", COUNT, horizon=12)
+    for made in ("policies/act", "correction", "monitor_training/checkpoints/last/pretrained_model"):
+        shutil.copytree(checkpoint, out / made)
+    recipe = StudyRecipe(
+        "fake", {"act": 1}, "act", "c", "r", interventions=["correction"],
+        policies_folder=str(out / "policies") if elsewhere else None,
+    )  # fmt: skip
+    study = assemble(out, recipe)
+    assert (study.root / "policies").exists() is not elsewhere
+    assert study.policy("act").is_dir()
+    assert [s.id for s in load_scenarios(study.scenarios)] == [
+        s.id for s in load_scenarios(parts / "scenarios")
+    ]
+    kinds = {
+        name: {str(v.dtype) for v in load_file(folder / "model.safetensors").values()}
+        for name, folder in {"correction": study.correction, "monitor": study.monitor}.items()
+    }
+    assert kinds == {"correction": {"torch.float16"}, "monitor": {"torch.float32"}}
+    assert read_definition(study.root) == study
 
 
 def test_a_study_names_a_set_of_the_package_where_its_scenarios_are_the_same(tmp_path):
