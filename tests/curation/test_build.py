@@ -214,7 +214,10 @@ def test_what_runs_again(stand_in):
         journal.append({"id": "ep-0000", "rejected": True})
     assert build(content=content) == ["validate", "split", "render", "publish"]
     shutil.rmtree(build.root / "split")
-    assert build(content=content) == ["split"]
+    assert build(content=content) == ["split", "render", "publish"]
+    shutil.rmtree(build.root / "screened")  # and with it all that was made of it, though no option changed
+    assert build(content=content, dry_run=True) == []
+    assert build(content=content) == ["screen", "validate", "split", "render", "publish"]
     record_decisions(
         Path(content["collect"]["mine"]["dataset"]), [Decision("ep-0001", "collect", "dropped", "x")]
     )

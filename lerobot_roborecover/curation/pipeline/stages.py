@@ -1,10 +1,10 @@
 """The whole chain from one file: collect, join, annotate, agree, screen, validate, split, render,
 publish.
 
-Each stage makes a folder of its own below `out`; `stages.jsonl` records what each finished stage
-was made from. A stage whose options and inputs are unchanged is not run again; one that is changed has its
-old result moved to `old/` first, and everything after it is made anew. What takes long (rollouts, votes,
-trials, replays) is kept beside the results and goes on where it was.
+Each stage makes a folder of its own below `out`; `stages.jsonl` records what each finished stage was made
+from. A stage whose options and inputs are unchanged is not run again. One that has changed, or whose result
+is gone, has its old result moved to `old/` first, and everything after it is made anew. What takes long
+(rollouts, votes, trials, replays) is kept beside the results and goes on where it was.
 """
 
 from __future__ import annotations
@@ -139,17 +139,20 @@ class Chain:
             records = read_journal(path, _SCHEMA)
             known = {r["label"]: r["key"] for r in records}
             pace = Pace(self.labels(until), {r["label"]: r["seconds"] for r in records})
-            key = ""
+            key, anew = "", False
             for stage in self._stages():
                 if until and STAGES.index(stage.name) > STAGES.index(until):
                     break
                 before = key
                 key = _key(before, stage)
-                forced = bool(first) and STAGES.index(stage.name) >= STAGES.index(first)
+                forced = anew or (bool(first) and STAGES.index(stage.name) >= STAGES.index(first))
                 there = stage.out is None or stage.out.exists()
                 fresh = known.get(stage.label) == key and there and stage.complete and not forced
                 what = "up to date" if fresh else "would run" if dry_run else "runs"
                 self.say(f"{pace.at(stage.label)} {stage.label}: {what}")
+                # The same key need not be the same result: trials that were kept, or the version, are others.
+                # What comes before `agree` is hashed for the stage after it.
+                anew = anew or (not fresh and STAGES.index(stage.name) >= STAGES.index("agree"))
                 seconds = 0.0
                 if not fresh and journal is not None:
                     began = time.monotonic()
