@@ -18,15 +18,12 @@ from hypothesis import strategies as st
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.screen.runs import forget_trials, parse_policies, take_trials
-from lerobot_roborecover.curation.screen.screening import (
-    ScreenRule,
+from lerobot_roborecover.curation.screen.screening import ScreenRule, provenance_of, screen, tally
+from lerobot_roborecover.curation.screen.tables import (
     format_histogram,
     format_policies,
     format_settled,
     histogram,
-    provenance_of,
-    screen,
-    tally,
 )
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore

@@ -17,13 +17,15 @@ from lerobot_roborecover.curation.screen.runs import (
 from lerobot_roborecover.curation.screen.screening import (
     Screened,
     ScreenRule,
+    provenance_of,
+    screen,
+    tally,
+)
+from lerobot_roborecover.curation.screen.tables import (
     format_histogram,
     format_policies,
     format_settled,
     histogram,
-    provenance_of,
-    screen,
-    tally,
 )
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios, read_scenarios

@@ -18,8 +18,6 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from lerobot_roborecover.curation.attrition import Decision
 from lerobot_roborecover.curation.policy_trials import check_repeats
 from lerobot_roborecover.curation.validate.validation import ValidationRule
@@ -30,7 +28,6 @@ KEEP = ("0.1", "0.9")
 """Shares of all trials (paper: a recovery rate between 10 % and 90 %); 2 to 18 of 20."""
 CURTAILED_LEAST = ValidationRule.runs
 """Trials that every scenario gets, however early its verdict is settled: as many as `validate` replays."""
-_BAR = 40
 
 
 @dataclass(frozen=True)
@@ -285,76 +282,3 @@ def provenance_of(found: Screened, run_seed: int) -> dict[str, Any]:
         "run_seed": run_seed,
         "policies": {name: asdict(count) for name, count in found.counts.items()},
     }
-
-
-def histogram(found: Sequence[Screened]) -> list[int]:
-    """Scenarios by number of successes, from none to all, those with too many invalid trials included."""
-    total = max((s.trials for s in found), default=0)
-    counts = Counter(s.successes for s in found)
-    return [counts[n] for n in range(total + 1)]
-
-
-def format_histogram(found: Sequence[Screened], rule: ScreenRule) -> str:
-    """The histogram as text; successes that stay are marked."""
-    bars = histogram(found)
-    low, high = rule.check(len(found[0].counts)) if found else (0, 0)
-    scale = max(max(bars, default=0) / _BAR, 1.0)
-    lines = [f"{'successes':>9} {'scenarios':>9}   (| stays)"]
-    for successes, count in enumerate(bars):
-        mark = "|" if low <= successes <= high else " "
-        lines.append(f"{successes:>9} {count:>9} {mark} {'#' * math.ceil(count / scale)}".rstrip())
-    return "\n".join(lines)
-
-
-def format_settled(found: Sequence[Screened]) -> str:
-    """After how many trials verdicts were settled, as text; for a curtailed screening, whose counts of
-    successes are not complete."""
-    run = Counter((sum(c.trials for c in s.counts.values()), s.decision.reason or "stays") for s in found)
-    reasons = sorted({reason for _, reason in run}, key=lambda reason: (reason != "stays", reason))
-    lines = ["  ".join([f"{'trials':>9}", *(f"{reason:>9}" for reason in reasons)])]
-    for trials in sorted({trials for trials, _ in run}):
-        cells = (f"{run[trials, reason]:>{max(9, len(reason))}}" for reason in reasons)
-        lines.append("  ".join([f"{trials:>9}", *cells]))
-    return "\n".join(lines)
-
-
-def format_policies(found: Sequence[Screened]) -> str:
-    """Each policy's recovery rate over all screened scenarios, and over those that stay, as text.
-
-    Rates weigh scenarios equally; intervals are those of every table (`analysis/intervals.py`), over the
-    platform's units. A policy that has not tried every scenario as often as the rule says has no rate: those
-    that it tried are those that others left open.
-    """
-    kept = [s for s in found if s.decision.verdict == "kept"]
-    names = sorted({name for s in found for name in s.counts})
-    width = max([len("policy"), *map(len, names)])
-    lines = [f"{'policy':<{width}}  {'recovered %':<21}{'of those kept %':<21}{'trials':>7}{'invalid':>9}"]
-    for name in names:
-        counts = [s.counts[name] for s in found]
-        trials, invalid = (sum(ns) for ns in ([c.trials for c in counts], [*map(_invalid, counts)]))
-        cells = f"{_rate(found, name):<21}{_rate(kept, name):<21}"
-        lines.append(f"{name:<{width}}  {cells}{trials:>7}{invalid:>9}")
-    return "\n".join(lines)
-
-
-def _invalid(count: PolicyCount) -> int:
-    return sum(count.invalid.values())
-
-
-def _rate(found: Sequence[Screened], policy: str) -> str:
-    from lerobot_roborecover.analysis.summary import rate_estimate
-    from lerobot_roborecover.analysis.units import default_unit, unit_labels
-
-    if not found:
-        return "n/a"
-    counts = [s.counts[policy] for s in found]
-    if any(s.counts[policy].trials * s.counts[policy].each_counts < s.rule.trials for s in found):
-        return "n/a (curtailed)"
-    rates = np.array([c.successes / c.trials for c in counts])
-    scenarios = [s.scenario for s in found]
-    unit = default_unit(scenarios[0].task.platform)
-    ids, clusters = [s.id for s in scenarios], [s.cluster for s in scenarios]
-    units = unit_labels(unit, ids, clusters, [s.task.name for s in scenarios])
-    estimate = rate_estimate(rates, units.tolist())
-    value, low, high = (100 * x for x in (estimate.value, estimate.low, estimate.high))
-    return f"{value:5.1f}" if low != low else f"{value:5.1f} [{low:.1f}, {high:.1f}]"
