@@ -25,6 +25,7 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
 from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
+from lerobot_roborecover.trials.sizes import usable_cores
 from lerobot_roborecover.whole import new_folder
 
 _CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
@@ -81,6 +82,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         once = recipe.policies[name] == 1
         donors += ["--trials-from", str(trials / name), "--deterministic"] if once else ["--donor"]
         donors.append(policy(name))
+    workers = ("--workers", str(usable_cores()))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(
@@ -107,7 +109,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
             "donors",
             (_cli(
                 "donors", *logs, "--scenarios", str(scenarios), "--base", policy(recipe.base), *donors, *env,
-                "--out", str(out / "donors"), "--license", "Apache-2.0",
+                "--out", str(out / "donors"), "--license", "Apache-2.0", *workers,
             ),),
             (out / "donors" / "meta" / "roborecover" / "donors.json",),
             (out / "donors",),
@@ -129,7 +131,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
                 "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
                 *(part for name in screening for part in ("--policy", policy(name))),
                 "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
-                "--out", str(out / "monitor_data"), "--license", "Apache-2.0",
+                "--out", str(out / "monitor_data"), "--license", "Apache-2.0", *workers,
             ),),
             (out / "monitor_data" / "validation_natural",),
         ),
