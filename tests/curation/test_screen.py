@@ -299,9 +299,14 @@ def test_written_with_provenance_and_history(screened, scenario_set, checkpoints
     assert sum(record["scenarios_by_successes"]) == 8
     assert json.loads((screened / "meta/roborecover/manifest.json").read_text())["license"] == "MIT"
     trials = screened.with_name("out.trials")
-    for policy in checkpoints:
+    for number, policy in enumerate(checkpoints):
         rows = read_trial_log(trials / policy.name / "trials.jsonl")
         assert len(rows) == 16
+        # A prefix is replayed once, for the first trial of the first policy.
+        replayed = {(r.scenario_id, r.trial) for r in rows if r.handoff_from_snapshot is False}
+        assert replayed - {(before[3].id, 0)} == (
+            {(s.id, 0) for s in before if s is not before[3]} if number == 0 else set()
+        )
         assert all((trials / policy.name / "actions" / f"{r.actions_sha256}.npy").exists()
                    for r in rows if r.steps)  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -134,7 +135,8 @@ def screen_dataset(
                 take_trials(other / policy.name, folder)
         if request.retry:
             forget_trials(folder, request.retry)
-    rows = _trials(request, scenarios, progress)
+    with tempfile.TemporaryDirectory(prefix="roborecover-screen-") as snapshots:
+        rows = _trials(request, scenarios, Path(snapshots), progress)
     if request.shard:
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic)
@@ -151,9 +153,14 @@ def screen_dataset(
 
 
 def _trials(
-    request: ScreenRequest, scenarios: ScenarioSet, progress: Callable[[str, int, int], None]
+    request: ScreenRequest,
+    scenarios: ScenarioSet,
+    snapshots: Path,
+    progress: Callable[[str, int, int], None],
 ) -> dict[str, list[TrialRow]]:
     """Every trial that the verdicts need, by the policy's name.
+
+    Each scenario's prefix is replayed for the first of them; on one machine the others go on from its handoff.
 
     A curtailed screening takes one policy after the other, those that need one trial only first, and as many
     trials of each as may settle some verdict, of the scenarios that are open then.
@@ -167,6 +174,7 @@ def _trials(
             policy, request.dataset, scenarios.platform, request.trials, trials=trials, only=only,
             run_seed=request.run_seed, env=request.env, shard=request.shard, device=request.device,
             slots=request.slots, max_batch=request.max_batch, replicas=request.replicas,
+            snapshots=None if request.workplace.on_cluster else snapshots,
             workplace=replace(request.workplace, fits=started),
             on_row=lambda row, done, total: progress(policy.name, done, total),
         )  # fmt: skip

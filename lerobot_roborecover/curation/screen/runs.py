@@ -177,6 +177,7 @@ def run_policy(
     max_batch: int = 64,
     workplace: Workplace = HERE,
     replicas: int = 0,
+    snapshots: Path | None = None,
     on_row: Callable[[Any, int, int], None] = lambda row, done, total: None,
 ) -> list[PolicyTrial]:
     """Runs what the policy's folder does not hold yet, and returns everything.
@@ -193,6 +194,7 @@ def run_policy(
         shard: `k/n`, or empty for everything.
         device: of the policy.
         slots, max_batch, workplace, replicas: of `run_trials`.
+        snapshots: folder of handoffs that other runs have left, where the options name none.
         on_row: told of each finished trial, and how many are done of how many.
 
     Raises:
@@ -202,6 +204,7 @@ def run_policy(
     claim_folder(policy, mine, env)
     given = [*env, *policy.env, *([f"shard={shard}"] if shard else [])]
     config = env_config(platform, scenarios, [f"--{option}" for option in given])
+    config.snapshot_dir = config.snapshot_dir or str(snapshots or "")
     return run_trials(
         policy.path, config, mine, trials=trials, only=only, seed=run_seed, device=device, slots=slots,
         max_batch=max_batch, workplace=workplace, replicas=replicas,
