@@ -160,7 +160,8 @@ def _trials(
 ) -> dict[str, list[TrialRow]]:
     """Every trial that the verdicts need, by the policy's name.
 
-    Each scenario's prefix is replayed for the first of them; on one machine the others go on from its handoff.
+    Each scenario's prefix is replayed for the first of them; on one machine the others
+    go on from its handoff.
 
     A curtailed screening takes one policy after the other, those that need one trial only first, and as many
     trials of each as may settle some verdict, of the scenarios that are open then.
