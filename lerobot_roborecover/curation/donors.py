@@ -202,6 +202,7 @@ def judge(
         else:
             donors.append(donor)
     what = f"donors: {options.successes} of {options.trials} trials succeed, all complete"
+    what += "; the one trial of a deterministic policy" if options.deterministic else ""
     add_step(funnel, what, len(donors), dropped)
     return donors
 

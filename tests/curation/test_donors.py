@@ -249,7 +249,7 @@ def test_the_command_reads_trials_and_shows_the_funnel(tmp_path, capsys):
     one = recorded(tmp_path / "one", [trial(s, GOOD, 0) for s in made])
     once = [*command, "--trials-from", str(one)]
     assert main([*once, "--deterministic", GOOD, "--out", str(tmp_path / "once")]) == 0
-    assert "     4  donors" in capsys.readouterr().out
+    assert "all complete; the one trial of a deterministic policy\n" in capsys.readouterr().out
     note = json.loads((tmp_path / "once" / "meta" / "roborecover" / "donors.json").read_text())
     assert note["options"]["deterministic"] == [GOOD]
     assert main([*once, "--out", str(tmp_path / "four")]) == 2
