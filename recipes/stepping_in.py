@@ -99,11 +99,14 @@ class SteppingIn:
         if not (donors / "meta" / "roborecover" / "donors.json").exists():
             # Of a run that was cut short; its trials are kept beside it.
             shutil.rmtree(donors, ignore_errors=True)
-            logs = [self.trials("donors", policy) for policy in (base, *self.subject.donors)]
-            named = [word for policy in self.subject.donors for word in ("--donor", str(policy))]
-            named += [word for policy in self.subject.donors for word in ("--deterministic", str(policy))]
+            logs = {policy: self.trials("donors", policy) for policy in (base, *self.subject.donors)}
+            named = [
+                word
+                for policy in self.subject.donors
+                for word in ("--trials-from", logs[policy].parent, "--deterministic", policy)
+            ]
             roborecover(
-                "donors", *logs, "--scenarios", self.subject.scenarios, "--base", base, *named,
+                "donors", *logs.values(), "--scenarios", self.subject.scenarios, "--base", base, *named,
                 "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
             )  # fmt: skip
         training = Training(

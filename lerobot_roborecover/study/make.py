@@ -77,11 +77,10 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
     ]  # fmt: skip
     logs += [str(base_trials / "trials.jsonl")] if of_base else []
     donors: list[str] = []
-    for name in (n for n in screening if n != recipe.base):
+    for part in (p for p in chain.screen.policies if p.name != recipe.base):
         # One trial says all of a policy that repeats itself, and screening has kept it.
-        once = recipe.policies[name] == 1
-        donors += ["--trials-from", str(trials / name), "--deterministic"] if once else ["--donor"]
-        donors.append(policy(name))
+        kept = ["--trials-from", str(trials / str(part.name)), "--deterministic"]
+        donors += [*(kept if part.deterministic else ["--donor"]), policy(str(part.name))]
     workers = ("--workers", str(usable_cores()))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
@@ -236,10 +235,10 @@ def _assemble(out: Path, recipe: StudyRecipe, folder: Path) -> None:
 
 
 def comes_with_the_package(made: Path, name: str) -> bool:
-    """Whether the scenarios that were made, and their splits, are those of a set of this name."""
+    """Whether the scenarios that were made, their names, cells and splits are those of a set of this name."""
     if name not in builtin_names():
         return False
-    ours, theirs = ({(s.sha256(), s.split) for s in load_scenarios(of)} for of in (made, name))
+    ours, theirs = ({(s.id, s.sha256(), s.cell, s.split) for s in load_scenarios(of)} for of in (made, name))
     return ours == theirs
 
 

@@ -284,7 +284,10 @@ def test_a_study_names_a_set_of_the_package_where_its_scenarios_are_the_same(tmp
     write_scenarios(same, list(shipped)[::-1], description="in another order")
     changed = replace(shipped[0], split="train" if shipped[0].split == "test" else "test")
     write_scenarios(other, [changed, *shipped[1:]], description="another split")
+    renamed = tmp_path / "renamed"
+    write_scenarios(renamed, [replace(shipped[0], id="renamed"), *shipped[1:]], description="another name")
     assert comes_with_the_package(same, "metaworld_starter")
+    assert not comes_with_the_package(renamed, "metaworld_starter")
     assert not comes_with_the_package(other, "metaworld_starter")
     assert not comes_with_the_package(same, "")
 
