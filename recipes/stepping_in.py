@@ -54,8 +54,8 @@ SUBJECTS = {
         (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 30,
     ),
     "metaworld": Subject(
-        str(_METAWORLD.parent / "scenarios"), _METAWORLD / "act",
-        (_METAWORLD / "tdmpc", _METAWORLD / "act_few", _METAWORLD / "act_clean"), 15,
+        "metaworld_recovery", _METAWORLD / "act",
+        (_METAWORLD / "tdmpc", _METAWORLD / "act_few", _METAWORLD / "act_clean"), 30,
     ),
 }  # fmt: skip
 

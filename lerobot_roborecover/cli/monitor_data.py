@@ -22,6 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--select", default="", help="which scenarios, e.g. 'suite=libero_goal; source=natural'")
     add("--policy", action="append", default=[], metavar="CHECKPOINT", help="screening policy; give it again")
     add(
+        "--trials-from", action="append", default=[], type=Path, metavar="DIR",
+        help="folder of a policy's trials with their actions, e.g. SCREENED.trials/NAME: the first of each "
+        "scenario is not run again; may be given again",
+    )  # fmt: skip
+    add(
         "--rollouts", action="append", default=[], type=Path, metavar="DIR",
         help="recorded continuations: a trajectory dataset whose episodes belong to the scenarios",
     )  # fmt: skip
@@ -81,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
         scenarios=args.scenarios,
         out=args.out,
         policies=args.policy,
+        trials_from=args.trials_from,
         rollouts=args.rollouts,
         revision=args.revision,
         split=args.split,

@@ -81,6 +81,10 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         # One trial says all of a policy that repeats itself, and screening has kept it.
         kept = ["--trials-from", str(trials / str(part.name)), "--deterministic"]
         donors += [*(kept if part.deterministic else ["--donor"]), policy(str(part.name))]
+    # Screening began with the trials that the monitor's data want, and stopped where a scenario was settled.
+    continued = [
+        part for name in screening for part in ("--policy", policy(name), "--trials-from", str(trials / name))
+    ]
     workers = ("--workers", str(usable_cores()))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
@@ -128,7 +132,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
             "monitor data",
             (_cli(
                 "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
-                *(part for name in screening for part in ("--policy", policy(name))),
+                *continued,
                 "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0", *workers,
             ),),

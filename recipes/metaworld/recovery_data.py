@@ -28,7 +28,7 @@ from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_de
 from recipes.training import Training
 
 STUDY = Path("lerobot_roborecover/data/metaworld_study")
-SCENARIOS = STUDY / "scenarios"
+SCENARIOS = "metaworld_recovery"
 POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}
 """Policies whose recoveries are learned from, and their trials of each training scenario."""
 SEEDS = (0, 1, 2, 3)

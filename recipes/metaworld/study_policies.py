@@ -35,6 +35,7 @@ POLICIES: dict[str, slice] = {
     "tdmpc": slice(None),
     "act_few": slice(12),
     "act_clean": slice(None, None, 2),
+    "act_shaken": slice(1, None, 2),
     "diffusion_few": slice(24),
 }
 """Which of each task's demonstrations a policy learns from, by its name."""

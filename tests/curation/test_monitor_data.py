@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -222,6 +223,30 @@ def test_the_command_runs_policies_once_and_goes_on_where_it_stopped(tmp_path, c
     assert counts["train"]["ids"] + counts["validation_natural"]["ids"] == 5
     assert counts["validation_natural"]["trajectories"] == 4
     assert "label 0" in capsys.readouterr().out
+    # The same from kept trials: of one policy, of both, and of both where some are not there.
+    from_kept = [
+        x for folder in sorted((tmp_path / "out.trials").glob("?-*")) for x in ("--trials-from", str(folder))
+    ]
+    short = shutil.copytree(from_kept[1], tmp_path / "short")
+    lines = (short / "trials.jsonl").read_text().splitlines(keepends=True)
+    (short / "trials.jsonl").write_text("".join(lines[:2]))
+    ways = {
+        "one": ([*argv[-2:], *from_kept[:2]], 5),
+        "both": (from_kept, 0),
+        "all": ([*argv[-4:], *from_kept], 0),
+        "some": ([*argv[-4:], "--trials-from", str(short), *from_kept[2:]], 3),
+    }
+    made = json.loads((tmp_path / "out" / "monitor_data.json").read_text())
+    for name, (options, ran) in ways.items():
+        out = tmp_path / name
+        assert main([*argv[:3], "--out", str(out), *argv[5:7], *options]) == 0
+        other = json.loads((out / "monitor_data.json").read_text())
+        assert (other["counts"], other["drivers"]) == (made["counts"], made["drivers"])
+        logs = list((tmp_path / f"{name}.trials").glob("*/trials.jsonl"))
+        assert sum(len(log.read_text().splitlines()) for log in logs) == ran
+    (short / "trials.jsonl").write_text("")
+    assert main([*argv[:7], "--trials-from", str(short)]) == 2
+    assert "it has no trial of the 5 scenarios" in capsys.readouterr().err
     # Interrupted after the first policy's first trials: the rest is run, what is there is kept.
     folder = next((tmp_path / "out.trials").glob("0-*"))
     before = policy_trials.read_trials(folder)  # in the order of the log

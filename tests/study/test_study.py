@@ -296,8 +296,8 @@ def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
     recipe = read_recipe("metaworld")
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
     assert [s.name for s in found] == [
-        "policies", *recipe.recordings, "scenarios", "donors", "correction", "monitor data", "monitor",
-        "monitor metrics",
+        "policies", *recipe.recordings, "scenarios", "base trials", "donors", "correction", "monitor data",
+        "monitor", "monitor metrics",
     ]  # fmt: skip
     assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
     assert {path.name for path in found[0].done} == set(recipe.policies), "none of them is forgotten"

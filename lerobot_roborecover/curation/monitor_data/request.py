@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,10 +15,11 @@ from lerobot_roborecover.curation.monitor_data.choice import (
     from_trials,
 )
 from lerobot_roborecover.curation.monitor_data.data import describe, write_monitor_data
-from lerobot_roborecover.curation.policy_trials import env_config, run_trials
+from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, read_trials, run_trials
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.datasets.trajectories import read_trajectories
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.env.identity import policy_identity
+from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class MonitorRequest:
     out: Path
     policies: Sequence[str] = ()
     """Checkpoints that continue every scenario once."""
+    trials_from: Sequence[Path] = ()
+    """Folders of trials that a command left, e.g. screening: the first of a scenario is not run again."""
     rollouts: Sequence[Path] = ()
     """Trajectory datasets with recorded continuations."""
     revision: str | None = None
@@ -68,8 +71,10 @@ def make_monitor_data(request: MonitorRequest, progress: Callable[[str, int, int
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what cannot be done, and the remedy.
     """
-    if not request.policies and not request.rollouts:
-        raise ScenarioError("nobody continues the scenarios: give --policy CHECKPOINT, or --rollouts DIR")
+    if not (request.policies or request.trials_from or request.rollouts):
+        raise ScenarioError(
+            "nobody continues the scenarios: give --policy CHECKPOINT, --trials-from DIR or --rollouts DIR"
+        )
     scenarios = load_scenarios(
         request.scenarios, revision=request.revision, split=request.split, select=request.select
     )
@@ -107,17 +112,49 @@ def _continuations(
 ) -> list[Continuation]:
     by_id = {s.id: s for s in scenarios}
     work = request.work or request.out.with_name(f"{request.out.name}.trials")
+    kept: dict[str, dict[str, PolicyTrial]] = {}
+    for folder in request.trials_from:
+        for trial in _first_trials(folder, by_id, dropped):
+            kept.setdefault(trial.row.policy, {})[trial.row.scenario_id] = trial
     found = []
     for number, policy in enumerate(request.policies):
-        trials = run_trials(
-            policy,
-            env_config(scenarios.platform, request.scenarios, options),
-            work / f"{number}-{Path(policy).name or 'policy'}",
-            seed=request.run_seed,
-            device=request.device,
-            on_row=lambda row, done, total: progress(f"trials of {row.policy}", done, total),
-        )
-        found += from_trials(trials, by_id, dropped)
+        trials = kept.pop(policy_identity(policy), {}) if kept else {}
+        missing = by_id.keys() - trials.keys()
+        if missing:
+            ran = run_trials(
+                policy,
+                env_config(scenarios.platform, request.scenarios, options),
+                work / f"{number}-{Path(policy).name or 'policy'}",
+                only=missing,
+                seed=request.run_seed,
+                device=request.device,
+                on_row=lambda row, done, total: progress(f"trials of {row.policy}", done, total),
+            )
+            trials |= {trial.row.scenario_id: trial for trial in ran}
+        found += from_trials([trials[i] for i in sorted(trials)], by_id, dropped)
+    for trials in kept.values():
+        found += from_trials([trials[i] for i in sorted(trials)], by_id, dropped)
     for folder in request.rollouts:
         found += from_rollouts(read_trajectories(folder), by_id, dropped)
+    return found
+
+
+def _first_trials(folder: Path, scenarios: Mapping[str, Scenario], dropped: Counter) -> list[PolicyTrial]:
+    """A policy's first trial of each of the scenarios, of those that a folder has.
+
+    Raises:
+        ScenarioError: none of them is of these scenarios, or the actions are damaged.
+        TrialLogError: the log is damaged.
+    """
+    found = []
+    for trial in read_trials(folder):
+        scenario = scenarios.get(trial.row.scenario_id)
+        if trial.row.trial or scenario is None:
+            continue
+        if trial.row.scenario_sha256 != scenario.sha256():
+            dropped["belongs to another version of its scenario"] += 1
+        else:
+            found.append(trial)
+    if not found:
+        raise ScenarioError(f"--trials-from {folder}: it has no trial of the {len(scenarios)} scenarios")
     return found
