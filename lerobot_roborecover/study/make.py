@@ -80,10 +80,12 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
     for part in (p for p in chain.screen.policies if p.name != recipe.base):
         # One trial says all of a policy that repeats itself, and screening has kept it.
         kept = ["--trials-from", str(trials / str(part.name)), "--deterministic"]
-        donors += [*(kept if part.deterministic else ["--donor"]), policy(str(part.name))]
+        donors += [*(kept if part.deterministic else ["--donor"]), str(part.path)]
     # Screening began with the trials that the monitor's data want, and stopped where a scenario was settled.
     continued = [
-        part for name in screening for part in ("--policy", policy(name), "--trials-from", str(trials / name))
+        word
+        for part in chain.screen.policies
+        for word in ("--policy", str(part.path), "--trials-from", str(trials / str(part.name)))
     ]
     workers = ("--workers", str(usable_cores()))
     correction, monitor = out / "correction_training", out / "monitor_training"

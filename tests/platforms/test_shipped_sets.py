@@ -24,6 +24,7 @@ SETS = [
 FEW = [
     pytest.param("metaworld_starter", 4, marks=pytest.mark.metaworld),
     pytest.param("metaworld_study", 3, marks=pytest.mark.metaworld),
+    pytest.param("metaworld_recovery", 3, marks=pytest.mark.metaworld),
     pytest.param("libero_starter", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
     pytest.param("libero_recovery", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
     pytest.param("pusht_starter", 4, marks=pytest.mark.slow),
@@ -33,6 +34,7 @@ LIBERO_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 WHOLE = [
     pytest.param("metaworld_starter", "", marks=pytest.mark.metaworld),
     pytest.param("metaworld_study", "", marks=pytest.mark.metaworld),
+    pytest.param("metaworld_recovery", "", marks=pytest.mark.metaworld),
     pytest.param("pusht_starter", ""),
     *(
         pytest.param(name, f"suite={s}", marks=pytest.mark.libero)

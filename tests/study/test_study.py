@@ -180,8 +180,9 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path,
     assert "Run the same command again" in message
 
 
-def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
-    recipe = read_recipe("libero")
+@pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
+def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
+    recipe = read_recipe(name)
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
     policies, *_, metrics = found
     assert policies.commands == ()
@@ -199,9 +200,15 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path):
     run, donors = found[names.index("base trials")].commands[0], found[names.index("donors")].commands[0]
     assert "--env.split=train" in run
     assert str(tmp_path / "base_trials" / "trials.jsonl") in donors
-    # All of its donors repeat themselves: what screening kept of them is enough.
-    assert "--donor" not in donors
-    assert donors.count("--deterministic") == donors.count("--trials-from") == len(chain.screen.policies)
+    # Of a donor that repeats itself what screening kept is enough; one that draws noise is run.
+    repeats = [p for p in chain.screen.policies if p.deterministic]
+    assert donors.count("--donor") == len(chain.screen.policies) - len(repeats)
+    assert donors.count("--deterministic") == donors.count("--trials-from") == len(repeats)
+    # What screening ran, the monitor's data need not run again.
+    words = found[names.index("monitor data")].commands[0]
+    paths = [str(p.path) for p in chain.screen.policies]
+    assert [words[i + 1] for i, word in enumerate(words) if word == "--policy"] == paths
+    assert words.count("--trials-from") == len(paths)
 
 
 @pytest.mark.parametrize(
@@ -296,8 +303,8 @@ def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
     recipe = read_recipe("metaworld")
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
     assert [s.name for s in found] == [
-        "policies", *recipe.recordings, "scenarios", "base trials", "donors", "correction", "monitor data",
-        "monitor", "monitor metrics",
+        "policies", *recipe.recordings, "scenarios", "donors", "correction", "monitor data", "monitor",
+        "monitor metrics",
     ]  # fmt: skip
     assert len({path for s in found for path in s.done}) == sum(len(s.done) for s in found)
     assert {path.name for path in found[0].done} == set(recipe.policies), "none of them is forgotten"
