@@ -50,7 +50,7 @@ SETS = {
         {"mujoco", "robosuite", "hf-libero", "libero_assets"}, dict.fromkeys(LIBERO_HORIZONS, 40),
     ),
     "metaworld_recovery": Wanted(
-        "metaworld", 300, 600, 15, 9, 4_000_000, {"act_shaken", "act_few", "act_clean", "tdmpc", "diffusion"},
+        "metaworld", 300, 600, 15, 9, 6_000_000, {"act_shaken", "act_few", "act_clean", "tdmpc", "diffusion"},
         {"mujoco", "metaworld"},
     ),
 }  # fmt: skip
