@@ -174,19 +174,13 @@ def _write_parquet(file: IO[bytes], scenarios: Sequence[Scenario]) -> None:
     # reader insists on that. zstd compresses repeats as well.
     # Actions are most of a file: sorted by byte they take a fifth less, and poses too.
     pose = "fingerprint.bodies.list.element"
+    by_byte = [f"{name}.list.element" for name in ("prefix", f"{pose}.position_m", f"{pose}.quat_xyzw")]
     options = {
         "compression": "zstd",
         "compression_level": 19,
         "use_dictionary": False,
         "write_statistics": False,
-        "column_encoding": {
-            name: "BYTE_STREAM_SPLIT"
-            for name in (
-                "prefix.list.element",
-                f"{pose}.position_m.list.element",
-                f"{pose}.quat_xyzw.list.element",
-            )
-        },
+        "column_encoding": dict.fromkeys(by_byte, "BYTE_STREAM_SPLIT"),
     }
     schema = pa.schema([*SCHEMA, RESET_OPTIONS]) if any(s.reset.options for s in scenarios) else SCHEMA
     with pq.ParquetWriter(file, schema, **options) as writer:
