@@ -1,8 +1,7 @@
-"""The shipped study: trials come out as stored, to the step. Nightly: one that a bit decides, and a slice."""
+"""The studies that ship and that stand in the checkout: trials come out as stored, to the step. Nightly: one
+that a bit decides, and a slice of each."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import pytest
 
@@ -12,13 +11,18 @@ from lerobot_roborecover.study.definition import read_definition, shipped_study
 from lerobot_roborecover.study.evaluate import run_arm, scenario_ids
 from lerobot_roborecover.study.outcomes import outcomes_of, read_outcomes
 
-EVERY = 32
-"""Two of the test scenarios: policies from both starts, and all interventions."""
+EVERY = {"metaworld": 32, "metaworld_recovery": 180}
+"""Two of each study's test scenarios: policies from both starts, and all interventions."""
+
+
+@pytest.fixture(scope="module", params=EVERY)
+def name(request):
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def study():
-    return read_definition(shipped_study())
+def study(name):
+    return read_definition(shipped_study(name))
 
 
 def test_every_trial_of_the_shipped_study_is_stored(study):
@@ -34,13 +38,13 @@ def test_every_trial_of_the_shipped_study_is_stored(study):
 @pytest.mark.lerobot
 @pytest.mark.metaworld
 @pytest.mark.slow
-def test_a_trial_that_a_bit_decides_comes_out_as_stored(study, tmp_path):
+def test_a_trial_that_a_bit_decides_comes_out_as_stored(tmp_path):
     """One step sooner on an AMD EPYC than on an Intel processor, as long as MKL took the square roots of its
     noise schedule in float32 (`trials/portable.py`), and with other kernels of MKL."""
     scenario = "scripted-operator-push-v3-s502-000049"
-    before = replace(study, dataset="metaworld_study")  # the set that it was found in
-    (arm,) = (a for a in arms(before, tmp_path, [scenario], slots=1) if a.label == "diffusion/initial")
-    run_arm(arm, before)
+    study = read_definition(shipped_study())
+    (arm,) = (a for a in arms(study, tmp_path, [scenario], slots=1) if a.label == "diffusion/initial")
+    run_arm(arm, study)
     assert outcomes_of([arm]) == {
         (arm.label, scenario, 0): ("success", 126),
         (arm.label, scenario, 1): ("success", 81),
@@ -51,10 +55,11 @@ def test_a_trial_that_a_bit_decides_comes_out_as_stored(study, tmp_path):
 @pytest.mark.metaworld
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_a_slice_comes_out_as_stored(study, tmp_path, capsys):
-    status = main(["study", "--every", str(EVERY), "--out", str(tmp_path), "--no-report"])
+def test_a_slice_comes_out_as_stored(name, study, tmp_path, capsys):
+    every = EVERY[name]
+    status = main(["study", "--name", name, "--every", str(every), "--out", str(tmp_path), "--no-report"])
     said = capsys.readouterr().out
     trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
-    total = trials * len(scenario_ids(study, EVERY))
+    total = trials * len(scenario_ids(study, every))
     assert status == 0, said
     assert f"{total} of {total} trials came out as stored, to the step" in said
