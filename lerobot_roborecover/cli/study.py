@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--make", action="store_true",
         help="make the study first, from nothing but the packages: train, build, fine-tune (hours)",
     )  # fmt: skip
+    add(
+        "--shipped-scenarios", action="store_true",
+        help="with --make: take the scenarios that come with the package instead of building them",
+    )  # fmt: skip
     add("--stage", action="append", default=[], metavar="NAME", help="with --make: this stage only; again")
     add("--print", action="store_true", help="print the commands and run nothing")
     add(
@@ -54,12 +58,17 @@ def run(args: argparse.Namespace) -> int:
             raise OptionError(f"--{name}={getattr(args, name)}: a count; 0 follows the cores")
     if args.stage and not args.make:
         raise OptionError("--stage names a stage of --make; add --make")
+    if args.shipped_scenarios and not args.make:
+        raise OptionError("--shipped-scenarios is of --make; add --make")
     if args.make:
         if args.data:
             raise OptionError("--make makes its own data below --out; leave out --data")
         from lerobot_roborecover.study.make import make
 
-        made = make(args.name, args.out, args.stage, say=lambda line: print(line, flush=True))
+        made = make(
+            args.name, args.out, args.stage, lambda line: print(line, flush=True),
+            shipped=args.shipped_scenarios,
+        )  # fmt: skip
         if made is None:
             return 0
     study = read_definition(args.out / "data" if args.make else args.data or shipped_study(args.name))

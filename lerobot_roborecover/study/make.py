@@ -44,37 +44,54 @@ class StudyStage:
     """Results of an interrupted run that the commands would refuse to write over."""
 
 
-def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStage]:
+def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool = False) -> list[StudyStage]:
     """The stages in their order; everything that they make lies below `out`.
 
     Args:
         out: working folder.
         recipe: how the study is made.
         chain: how its scenarios are built (`chain_for`).
+        shipped: take the scenarios that come with the package. The trials that screened them do not, so the
+            panel's policies are tried on the training split in their place.
+
+    Raises:
+        ScenarioError: `shipped`, and the recipe's set does not come with the package.
     """
+    if shipped and recipe.dataset not in builtin_names():
+        raise ScenarioError(
+            f"set {recipe.dataset!r} of this study does not come with the package; these do: "
+            f"{', '.join(builtin_names())}. Leave out --shipped-scenarios to build it"
+        )
 
     def policy(name: str) -> str:
         return str(recipe.policy(out, name))
 
     screening = [str(p.name) for p in chain.screen.policies]
-    trials = out / "scenarios" / "screened.trials"
-    scenarios = out / "scenarios" / "split"
+    trials = out / "panel_trials" if shipped else out / "scenarios" / "screened.trials"
+    scenarios = recipe.dataset if shipped else str(out / "scenarios" / "split")
+
+    def trials_of(path: str, count: int, folder: Path, *options: str) -> tuple[str, ...]:
+        return _cli(
+            "eval", "--env", f"roborecover_{recipe.platform}", f"--env.scenarios={scenarios}",
+            "--env.split=train", *(f"--env.{n}={value}" for n, value in recipe.env.items()),
+            *options, f"--policy.path={path}", f"--eval.n_episodes={count}", f"--output_dir={folder}",
+        )  # fmt: skip
+
     env = [part for name, value in recipe.env.items() for part in ("--env", f"{name}={value}")]
     logs = [str(trials / name / "trials.jsonl") for name in screening]
     base_trials = out / "base_trials"
     # A base that had no say in screening has no trials yet.
-    of_base = [] if recipe.base in screening else [
-        StudyStage(
-            "base trials",
-            (_cli(
-                "eval", "--env", f"roborecover_{recipe.platform}", f"--env.scenarios={scenarios}",
-                "--env.split=train", *(f"--env.{name}={value}" for name, value in recipe.env.items()),
-                f"--policy.path={policy(recipe.base)}", f"--eval.n_episodes={recipe.policies[recipe.base]}",
-                f"--output_dir={base_trials}",
-            ),),
-            (base_trials / "eval_info.json",),
-        )
-    ]  # fmt: skip
+    of_base = (
+        []
+        if recipe.base in screening
+        else [
+            StudyStage(
+                "base trials",
+                (trials_of(policy(recipe.base), recipe.policies[recipe.base], base_trials),),
+                (base_trials / "eval_info.json",),
+            )
+        ]
+    )
     logs += [str(base_trials / "trials.jsonl")] if of_base else []
     donors: list[str] = []
     for part in (p for p in chain.screen.policies if p.name != recipe.base):
@@ -87,14 +104,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         for part in chain.screen.policies
         for word in ("--policy", str(part.path), "--trials-from", str(trials / str(part.name)))
     ]
-    workers = ("--workers", str(usable_cores()))
-    correction, monitor = out / "correction_training", out / "monitor_training"
-    return [
-        StudyStage(
-            "policies",
-            tuple(_program(words, out) for words in [recipe.train_policies] if words),
-            tuple(recipe.policy(out, name) for name in recipe.policies),
-        ),
+    built = [
         *(
             StudyStage(
                 name,
@@ -107,13 +117,36 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         StudyStage(
             "scenarios",
             (_cli("build", str(out / Path(recipe.chain).name)),),
-            (scenarios,),
+            (Path(scenarios),),
         ),
+    ]
+    panel = [
+        StudyStage(
+            "panel trials",
+            tuple(
+                trials_of(
+                    str(p.path), 1 if p.deterministic else chain.screen.trials or 5, trials / str(p.name),
+                    "--env.record_actions=true",
+                )
+                for p in chain.screen.policies
+            ),
+            tuple(trials / name / "eval_info.json" for name in screening),
+        )
+    ]  # fmt: skip
+    workers = ("--workers", str(usable_cores()))
+    correction, monitor = out / "correction_training", out / "monitor_training"
+    return [
+        StudyStage(
+            "policies",
+            tuple(_program(words, out) for words in [recipe.train_policies] if words),
+            tuple(recipe.policy(out, name) for name in recipe.policies),
+        ),
+        *(panel if shipped else built),
         *of_base,
         StudyStage(
             "donors",
             (_cli(
-                "donors", *logs, "--scenarios", str(scenarios), "--base", policy(recipe.base), *donors, *env,
+                "donors", *logs, "--scenarios", scenarios, "--base", policy(recipe.base), *donors, *env,
                 "--out", str(out / "donors"), "--license", "Apache-2.0", *workers,
             ),),
             (out / "donors" / "meta" / "roborecover" / "donors.json",),
@@ -133,7 +166,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig) -> list[StudyStag
         StudyStage(
             "monitor data",
             (_cli(
-                "monitor-data", "--scenarios", str(scenarios), *env, "--split-by", "cluster",
+                "monitor-data", "--scenarios", scenarios, *env, "--split-by", "cluster",
                 *continued,
                 "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0", *workers,
@@ -166,7 +199,12 @@ def _last_step(config: Path) -> str:
 
 
 def make(
-    name: str, out: Path, only: Sequence[str] = (), say: Callable[[str], None] = print
+    name: str,
+    out: Path,
+    only: Sequence[str] = (),
+    say: Callable[[str], None] = print,
+    *,
+    shipped: bool = False,
 ) -> StudyDefinition | None:
     """Runs what is missing and puts the study together in `out/data`; None where stages are left out.
 
@@ -175,12 +213,13 @@ def make(
         out: working folder; a rerun goes on there.
         only: names of stages; empty runs all.
         say: takes progress lines.
+        shipped: take the scenarios that come with the package, as `stages`.
 
     Raises:
-        ScenarioError: a command failed, or there is no such study or stage.
+        ScenarioError: a command failed, or there is no such study or stage, or no such set.
     """
     recipe = read_recipe(name)
-    todo = stages(out, recipe, chain_for(out, recipe))
+    todo = stages(out, recipe, chain_for(out, recipe), shipped=shipped)
     unknown = set(only) - {s.name for s in todo}
     if unknown:
         raise ScenarioError(f"no stage {sorted(unknown)}; there are {[s.name for s in todo]}")
@@ -200,7 +239,7 @@ def make(
         minutes = (time.monotonic() - began) / 60
         say(f"{where}: {minutes:.1f} min")
         append_records(out / "stages.jsonl", {"stage": stage.name, "minutes": round(minutes, 1)})
-    return None if only else assemble(out, recipe)
+    return None if only else assemble(out, recipe, shipped=shipped)
 
 
 def chain_for(out: Path, recipe: StudyRecipe) -> ChainConfig:
@@ -211,20 +250,20 @@ def chain_for(out: Path, recipe: StudyRecipe) -> ChainConfig:
     return read_config(out / chain.name)
 
 
-def assemble(out: Path, recipe: StudyRecipe) -> StudyDefinition:
-    """Copies what an evaluation needs into `out/data` and writes its definition."""
+def assemble(out: Path, recipe: StudyRecipe, *, shipped: bool = False) -> StudyDefinition:
+    """Copies what an evaluation needs into `out/data` and writes its definition; `shipped` as `stages`."""
     data = out / "data"
     with new_folder(data, replace=True) as folder:
-        _assemble(out, recipe, folder)
+        _assemble(out, recipe, folder, shipped=shipped)
     return read_definition(data)
 
 
-def _assemble(out: Path, recipe: StudyRecipe, folder: Path) -> None:
+def _assemble(out: Path, recipe: StudyRecipe, folder: Path, *, shipped: bool) -> None:
     ignore = shutil.ignore_patterns("train_config.json", "videos", "images", "*.html")
     for name in () if recipe.policies_folder else recipe.policies:
         shutil.copytree(recipe.policy(out, name), folder / "policies" / name, ignore=ignore)
     split, kept = out / "scenarios" / "split", Path("meta") / "roborecover"
-    with_package = comes_with_the_package(split, recipe.dataset)
+    with_package = shipped or comes_with_the_package(split, recipe.dataset)
     if not with_package:
         shutil.copytree(split / kept, folder / "scenarios" / kept, ignore=ignore)
     ship(out / "correction", folder / "correction")

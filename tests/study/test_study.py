@@ -164,6 +164,7 @@ def test_refusals(study, tmp_path, capsys):
     assert "--every=0: a count from 1" in refused("--data", str(study), "--every", "0")
     assert "--jobs=-1: a count" in refused("--data", str(study), "--jobs", "-1")
     assert "add --make" in refused("--stage", "policies")
+    assert "add --make" in refused("--shipped-scenarios")
     (study / "outcomes.csv").write_text("arm,scenario_id,trial,outcome,steps\na,b,c,d,e\n")
     with pytest.raises(ScenarioError, match="line 2"):
         read_outcomes(study / "outcomes.csv")
@@ -209,6 +210,35 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
     paths = [str(p.path) for p in chain.screen.policies]
     assert [words[i + 1] for i, word in enumerate(words) if word == "--policy"] == paths
     assert words.count("--trials-from") == len(paths)
+
+
+@pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
+def test_a_set_that_ships_need_not_be_built_again(tmp_path, name):
+    """Its screening trials do not ship: the panel is tried once more, and is all that is read afterwards."""
+    recipe = read_recipe(name)
+    chain = chain_for(tmp_path, recipe)
+    found = {s.name: s for s in stages(tmp_path, recipe, chain, shipped=True)}
+    assert list(found) == [
+        "policies", "panel trials", "base trials", "donors", "correction", "monitor data", "monitor",
+        "monitor metrics",
+    ]  # fmt: skip
+    for panelist, run, done in zip(
+        chain.screen.policies, found["panel trials"].commands, found["panel trials"].done, strict=True
+    ):
+        assert f"--env.scenarios={recipe.dataset}" in run
+        assert f"--eval.n_episodes={1 if panelist.deterministic else chain.screen.trials}" in run
+        assert f"--output_dir={done.parent}" in run
+        assert "--env.record_actions=true" in run
+        assert str(done.parent / "trials.jsonl") in found["donors"].commands[0]
+        assert str(done.parent) in found["monitor data"].commands[0]
+    everything = [word for s in found.values() for command in s.commands for word in command]
+    assert not any(str(tmp_path / "scenarios") in word for word in everything)
+
+
+def test_a_set_that_does_not_ship_has_to_be_built(tmp_path):
+    recipe = replace(read_recipe("libero"), dataset="nowhere")
+    with pytest.raises(ScenarioError, match="'nowhere' of this study does not come with the package"):
+        stages(tmp_path, recipe, chain_for(tmp_path, recipe), shipped=True)
 
 
 @pytest.mark.parametrize(
@@ -271,6 +301,11 @@ def test_what_is_made_is_put_together_as_a_study(parts, tmp_path, elsewhere):
         "fake", {"act": 1}, "act", "c", "r", interventions=["correction"],
         policies_folder=str(out / "policies") if elsewhere else None,
     )  # fmt: skip
+    study = assemble(out, recipe)
+    shipped = replace(recipe, dataset="metaworld_starter")
+    assert assemble(out, shipped, shipped=True).scenarios == "metaworld_starter"
+    assert not (out / "data" / "scenarios").exists()
+    assert assemble(out, shipped).scenarios == str(out / "data" / "scenarios"), "others were made"
     study = assemble(out, recipe)
     assert (study.root / "policies").exists() is not elsewhere
     assert study.policy("act").is_dir()
