@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.check import CheckRequest, check_platform
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
@@ -34,3 +36,35 @@ def test_progress_that_is_none_or_disturbs_is_named(monkeypatch):
     checks = {c.name: c for c in check_platform(CheckRequest("fake", (task,), steps=4))}
     assert "progress() is 1.0 where succeeded() is False" in str(checks[f"{task.name}: state"])
     assert checks[f"{task.name}: pictures in between"].failed
+
+
+def test_places_that_the_first_step_alone_puts_right_are_named(monkeypatch):
+    """As Meta-World's own coffee machine: its button follows with the first step."""
+    honest = FakeSimulator.reset
+
+    def late(self, task, reset):
+        honest(self, task, reset)
+        self.late = True
+
+    def bodies(self):
+        places = true(self)
+        if not self.__dict__.get("late"):
+            return places
+        name = next(n for n in places if not n.startswith("eef"))
+        x, y, z = places[name].position_m
+        return {**places, name: replace(places[name], position_m=(x + 0.06, y, z))}
+
+    def restore(self, snapshot):
+        given(self, snapshot)
+        self.late = False
+
+    true, given = FakeSimulator.bodies, FakeSimulator.restore
+    task = platform_named("fake").tasks()[0]
+    name = f"{task.name}: first places"
+    good = {c.name: c for c in check_platform(CheckRequest("fake", (task,), steps=4))}
+    assert not good[name].failed
+    for wrong in (late, bodies, restore):
+        monkeypatch.setattr(FakeSimulator, "reset" if wrong is late else wrong.__name__, wrong)
+    found = {c.name: c for c in check_platform(CheckRequest("fake", (task,), steps=4))}[name]
+    assert found.failed
+    assert "60 mm from where the same state has it once it is restored" in str(found)

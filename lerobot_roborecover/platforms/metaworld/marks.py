@@ -47,18 +47,19 @@ def handled_body(env: SawyerXYZEnv, parts: Mapping[str, Iterable[int]], raw: np.
     return min(distances, key=distances.__getitem__, default=None)
 
 
-def marks(task_name: str, handled: str | None, raw: np.ndarray) -> dict[str, Pose]:
+def marks(task_name: str, handled: str | None, raw: np.ndarray, behind: np.ndarray) -> dict[str, Pose]:
     """The marks of a task at a moment; without a direction of their own.
 
     Args:
         task_name: decides where the handled point ends.
         handled: see `handled_body`; without it there are no marks.
         raw: (39,) observation with the goal shown.
+        behind: (3,) metres by which it has the handled point too short: of a first state.
     """
     if handled is None:
         return {}
     goal = raw[_GOAL] + FINAL_OFFSET_M.get(task_name, (0.0, 0.0, 0.0))
     return {
-        f"{handled}{HANDLE}": Pose(tuple(raw[_OBJECT]), _UPRIGHT),
+        f"{handled}{HANDLE}": Pose(tuple(raw[_OBJECT] + behind), _UPRIGHT),
         GOAL: Pose(tuple(goal), _UPRIGHT),
     }
