@@ -13,6 +13,7 @@ finished is skipped. At the end, tables with intervals over runs and scenarios
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.analysis.style import LINE, colour, dash, drawing, marker, svg_of
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.whole import new_folder
 from recipes.commands import evaluate, roborecover
@@ -181,6 +183,52 @@ def train(out: Path, name: str, seed: int, options: Sequence[str] = ()) -> Path:
     return result
 
 
+def draw_curve(report: Path) -> Path:
+    """The curve of success against the share of recoveries, from the report's own tables, as an SVG.
+
+    Raises:
+        OSError, ValueError: there is no report of methods.
+    """
+    tables = json.loads((report / "results.json").read_text())["tables"]
+    column = {c["title"]: i for i, c in enumerate(tables["methods"]["columns"])}
+    like_these = {row[0]: row[column["RSR %, runs like these"]] for row in tables["methods"]["rows"]}
+    overall = [c["title"] for c in tables["overall"]["columns"]].index("Initial state %")
+    initial = {row[0]: row[overall] for row in tables["overall"]["rows"]}
+    runs = [(row[0], row[2]["value"]) for row in tables["runs"]["rows"]]
+    with drawing() as subplots:
+        plot, axes = subplots(6.4, 3.6)
+        for i, (label, values) in enumerate((("recovery", like_these), ("initial states", initial))):
+            for shaken in (False, True):
+                names = [n for n in values if MIXTURES[n].shaken is shaken]
+                found = 100 * np.array([[values[n][k] for k in ("value", "low", "high")] for n in names])
+                if len(found):
+                    places = [_place(n) + i * 0.6 for n in names]
+                    spans = [found[:, 0] - found[:, 1], found[:, 2] - found[:, 0]]
+                    axes.errorbar(
+                        places, found[:, 0], spans, color=colour(i), marker=marker(i), ms=5, lw=1.4,
+                        capsize=3, ls="none" if shaken else dash(i), label=None if shaken else label,
+                    )  # fmt: skip
+        axes.plot([_place(n) - 0.8 for n, _ in runs], [100 * v for _, v in runs], ".", color=colour(0), ms=4)
+        shown = [n for n in MIXTURES if n in like_these]
+        ticks = {
+            _place(n): "shaken" if MIXTURES[n].shaken else f"{MIXTURES[n].recoveries:.0%}" for n in shown
+        }
+        axes.set_xticks(list(ticks), list(ticks.values()))
+        axes.set_xlabel("share of the frames that are recoveries")
+        axes.set_ylabel("success, %")
+        axes.set_ylim(0, 100)
+        axes.grid(color=LINE, lw=0.6)
+        axes.legend(loc="lower left")
+        path = report / "recovery_data.svg"
+        path.write_bytes(svg_of(plot))
+    return path
+
+
+def _place(name: str) -> float:
+    mixture = MIXTURES[name]
+    return 62.0 if mixture.shaken else 100 * mixture.recoveries
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -208,6 +256,8 @@ def main() -> None:
         "report", *(f"{n}={','.join(of)}" for n, of in logs.items()),
         "--out", args.out / "report",
     )  # fmt: skip
+    if len(args.seeds) > 1:
+        print(f"curve     {draw_curve(args.out / 'report')}")
 
 
 if __name__ == "__main__":

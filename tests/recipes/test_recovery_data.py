@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recipes.metaworld.dataset import STUDY_TASKS, Episode, create_dataset, save_episode
-from recipes.metaworld.recovery_data import MIXTURES, Mixture, draw, frames_of, mixtures, read_episodes
+from recipes.metaworld.recovery_data import (
+    MIXTURES,
+    Mixture,
+    draw,
+    draw_curve,
+    frames_of,
+    mixtures,
+    read_episodes,
+)
 
 
 def episode(length: int, mark: float = 0.0) -> Episode:
@@ -61,3 +71,26 @@ def test_episodes_come_back_from_a_dataset(tmp_path):
     assert found[1][1].observations.shape == (6, 39)
     assert found[2][1].actions[0, 0] == 3.0
     assert found[2][1].solved.tolist() == [False, False, True]
+
+
+def test_the_curve_shows_each_mixture_at_its_share(tmp_path):
+    def percent(value: float) -> dict:
+        return {"value": value, "low": value - 0.1, "high": value + 0.1}
+
+    rates = {"clean": 0.3, "recoveries_25": 0.5, "shaken": 0.4}
+    tables = {
+        "methods": {
+            "columns": [{"title": t} for t in ("Method", "Runs", "RSR %, runs like these")],
+            "rows": [[name, 2, percent(rate)] for name, rate in rates.items()],
+        },
+        "overall": {
+            "columns": [{"title": t} for t in ("Policy", "Initial state %")],
+            "rows": [[name, percent(0.8)] for name in rates],
+        },
+        "runs": {"rows": [[name, f"{name}_{i}", percent(r)] for name, r in rates.items() for i in (0, 1)]},
+    }
+    (tmp_path / "results.json").write_text(json.dumps({"tables": tables}))
+    drawn = draw_curve(tmp_path).read_text()
+    assert all(f">{label}<" in drawn for label in ("0%", "25%", "shaken", "recovery", "initial states"))
+    assert ">10%<" not in drawn
+    assert ">50%<" not in drawn
