@@ -91,6 +91,8 @@ def test_the_curve_shows_each_mixture_at_its_share(tmp_path):
     }
     (tmp_path / "results.json").write_text(json.dumps({"tables": tables}))
     drawn = draw_curve(tmp_path).read_text()
-    assert all(f"<!-- {label} -->" in drawn for label in ("0%", "25%", "shaken", "recovery", "initial states"))
+    assert all(
+        f"<!-- {label} -->" in drawn for label in ("0%", "25%", "shaken", "recovery", "initial states")
+    )
     assert "<!-- 10% -->" not in drawn
     assert "<!-- 50% -->" not in drawn
