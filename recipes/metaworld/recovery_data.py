@@ -54,6 +54,7 @@ MIXTURES = {
     "recoveries_50": Mixture(0.5),
     "shaken": Mixture(0.0, shaken=True),
 }
+_SHAKEN_AT = 62.0
 
 
 def make_recoveries(out: Path, pool: dict[str, int]) -> Path:
@@ -187,7 +188,7 @@ def draw_curve(report: Path) -> Path:
     """The curve of success against the share of recoveries, from the report's own tables, as an SVG.
 
     Raises:
-        OSError, ValueError: there is no report of methods.
+        OSError, KeyError: there is no report, or none of methods of several runs.
     """
     tables = json.loads((report / "results.json").read_text())["tables"]
     column = {c["title"]: i for i, c in enumerate(tables["methods"]["columns"])}
@@ -225,8 +226,9 @@ def draw_curve(report: Path) -> Path:
 
 
 def _place(name: str) -> float:
+    """On the curve's axis, in per cent of recoveries; beyond its end what has no place on it."""
     mixture = MIXTURES[name]
-    return 62.0 if mixture.shaken else 100 * mixture.recoveries
+    return _SHAKEN_AT if mixture.shaken else 100 * mixture.recoveries
 
 
 def main() -> None:

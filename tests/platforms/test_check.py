@@ -40,31 +40,22 @@ def test_progress_that_is_none_or_disturbs_is_named(monkeypatch):
 
 def test_places_that_the_first_step_alone_puts_right_are_named(monkeypatch):
     """As Meta-World's own coffee machine: its button follows with the first step."""
-    honest = FakeSimulator.reset
+    reset, bodies, restore = FakeSimulator.reset, FakeSimulator.bodies, FakeSimulator.restore
+    late = []
 
-    def late(self, task, reset):
-        honest(self, task, reset)
-        self.late = True
-
-    def bodies(self):
-        places = true(self)
-        if not self.__dict__.get("late"):
-            return places
+    def late_bodies(simulator):
+        places = bodies(simulator)
         name = next(n for n in places if not n.startswith("eef"))
         x, y, z = places[name].position_m
-        return {**places, name: replace(places[name], position_m=(x + 0.06, y, z))}
+        return {**places, name: replace(places[name], position_m=(x + 0.06, y, z))} if late else places
 
-    def restore(self, snapshot):
-        given(self, snapshot)
-        self.late = False
-
-    true, given = FakeSimulator.bodies, FakeSimulator.restore
     task = platform_named("fake").tasks()[0]
     name = f"{task.name}: first places"
     good = {c.name: c for c in check_platform(CheckRequest("fake", (task,), steps=4))}
     assert not good[name].failed
-    for wrong in (late, bodies, restore):
-        monkeypatch.setattr(FakeSimulator, "reset" if wrong is late else wrong.__name__, wrong)
+    monkeypatch.setattr(FakeSimulator, "reset", lambda sim, *of: (late.append(1), reset(sim, *of))[1])
+    monkeypatch.setattr(FakeSimulator, "bodies", late_bodies)
+    monkeypatch.setattr(FakeSimulator, "restore", lambda sim, kept: (late.clear(), restore(sim, kept))[1])
     found = {c.name: c for c in check_platform(CheckRequest("fake", (task,), steps=4))}[name]
     assert found.failed
     assert "60 mm from where the same state has it once it is restored" in str(found)

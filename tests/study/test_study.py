@@ -17,9 +17,10 @@ from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
 from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition
 from lerobot_roborecover.study.evaluate import compare_with_stored
-from lerobot_roborecover.study.make import assemble, chain_for, comes_with_the_package, stages
+from lerobot_roborecover.study.make import assemble, chain_for, comes_with_the_package
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
 from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
+from lerobot_roborecover.study.stages import stages
 from tests.support.factories import fake_dataset, save_policy
 
 COUNT = 4
