@@ -37,18 +37,22 @@ WAYS = {True: "memory", False: "pipes"}
 
 
 class PictureServer(SlotServer):
-    """The fake simulator's slot, with two pictures in every observation; other ones after every step."""
+    """The fake simulator's slot, with two pictures in every observation, which follow from state and step
+    alone: whichever slot has a trial, it shows the same."""
 
     def __init__(self, config: SlotConfig):
         super().__init__(config)
         size = config.settings["size"]
+        self._step = 0
         self._pictures = np.random.default_rng(0).integers(0, 256, (2, size, size, 3), dtype=np.uint8)
 
     def answer(self, command: str, argument: Any = None) -> Any:
         """The usual answer, and pictures."""
         reply = super().answer(command, argument)
         if isinstance(reply, EpisodeStart | ActResult) and reply.observation is not None:
-            self._pictures[:, 0, 0, 0] += 1
+            self._step = 0 if isinstance(reply, EpisodeStart) else self._step + 1
+            shown = hashlib.sha256(reply.observation["agent_pos"].tobytes() + self._step.to_bytes(4)).digest()
+            self._pictures[:, 0, :8, 0] = np.frombuffer(shown, np.uint8)[:8]
             pictures = {"image": self._pictures[0], "image2": self._pictures[1]}
             return replace(reply, observation={**reply.observation, "pixels": pictures})
         return reply
@@ -69,7 +73,7 @@ class LookingHost(StubHost):
         if self._hashed:
             for one in observations:
                 pictures = b"".join(one["pixels"][key].tobytes() for key in sorted(one["pixels"]))
-                self.seen.append(hashlib.sha256(pictures).hexdigest())
+                self.seen.append(hashlib.sha256(one["agent_pos"].tobytes() + pictures).hexdigest())
         return super().act(observations, instructions, histories)
 
 

@@ -21,5 +21,5 @@ def test_both_ways_show_the_same():
     args = Namespace(slots=2, size=64, steps=20, trials=2)
     found = [measure(memory, args, hashed=True) for memory in (True, False)]
     assert found[0]["steps"] == found[1]["steps"] > 20
-    assert found[0]["seen"] == found[1]["seen"]
+    assert found[0]["seen"] == found[1]["seen"], "whichever slot had which trial"
     assert len(set(found[0]["seen"])) > 10, "the pictures change"
