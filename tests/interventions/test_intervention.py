@@ -6,6 +6,7 @@ import json
 import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -311,3 +312,32 @@ def test_a_person_is_not_asked_for_trials_that_are_over(dataset, checkpoints, mo
     batch = {"observation.state": torch.zeros(2, 4), "observation.environment_state": torch.zeros(2, 6)}
     with pytest.raises(OptionError, match="batch_size=1"):
         policy.select_action({**batch, "task": ["a", "b"]})
+
+
+@pytest.mark.parametrize("mode", ["reversion", "correction", "monitor_reversion", "monitor_correction"])
+def test_what_ships_for_libero_fits_its_environment(mode):
+    """LIBERO's own features name parts of the robot's state, and policies get one vector."""
+    from lerobot.policies import make_policy
+
+    from lerobot_roborecover.env.configs import ENV_TYPES
+    from lerobot_roborecover.interventions.configuration_intervention import (
+        MemberConfig,
+        MonitorConfig,
+        RoboRecoverInterventionConfig,
+    )
+
+    root = Path(__file__).parents[2] / "policies"
+
+    def make(**env):
+        config = RoboRecoverInterventionConfig(
+            base=MemberConfig(str(root / "libero" / "act_few")),
+            correction=MemberConfig(str(root / "study" / "libero" / "correction")),
+            monitor=MonitorConfig(str(root / "study" / "libero" / "monitor")),
+            mode=mode,
+            device="cpu",
+        )
+        return make_policy(config, env_cfg=ENV_TYPES["libero"](**env))
+
+    assert make(obs_type="state").director is not None
+    with pytest.raises(OptionError, match=r"observation\.environment_state .*nothing of that name"):
+        make()

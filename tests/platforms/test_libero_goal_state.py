@@ -145,6 +145,31 @@ def test_lerobot_is_told():
     assert "observation.environment_state" not in env_to_policy_features(LiberoConfig())
 
 
+@pytest.mark.lerobot
+@pytest.mark.parametrize("obs_type", ["state", "pixels_agent_pos", "pixels"])
+def test_lerobot_is_told_what_its_processor_gives(obs_type):
+    import torch
+    from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+    from lerobot_roborecover.platforms.libero.env_config import LiberoConfig
+
+    config = LiberoConfig(obs_type=obs_type)
+    raw = {}
+    if obs_type != "pixels":
+        sizes = {"eef": {"pos": (3,), "quat": (4,), "mat": (3, 3)}, "gripper": {"qpos": (2,), "qvel": (2,)}}
+        sizes["joints"] = {"pos": (7,), "vel": (7,)}
+        raw["robot_state"] = {k: {n: np.ones((1, *s)) for n, s in of.items()} for k, of in sizes.items()}
+    if obs_type == "state":
+        raw["environment_state"] = np.zeros((1, ENVIRONMENT_STATE_DIM))
+    else:
+        picture = np.zeros((1, config.observation_height, config.observation_width, 3), np.uint8)
+        raw["pixels"] = {"image": picture, "image2": picture}
+    before, _ = config.get_env_processors()
+    given = before(preprocess_observation(raw))
+    told = {k: f.shape for k, f in env_to_policy_features(config).items() if k != "action"}
+    assert told == {k: tuple(v.shape[1:]) for k, v in given.items() if isinstance(v, torch.Tensor)}
+
+
 def test_the_page_has_the_table():
     page = (Path(__file__).parents[2] / "docs" / "libero_state.md").read_text()
     rows = [line.strip("| ").split(" | ", 1) for line in page.splitlines() if line.startswith("| ")][1:]

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import LiberoEnv
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.processor.env_processor import LiberoProcessorStep
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
@@ -23,6 +24,7 @@ from lerobot_roborecover.platforms.base import (
 from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 
+_ROBOT_STATE = "robot_state/"
 _FAST_PICTURES = 2
 """Of how `fast` draws (`fast.py`, `decimation.py`); another number where pictures change, so that no log
 mixes them."""
@@ -53,6 +55,7 @@ class LiberoConfig(LiberoEnv, FilmedEnvConfig):
             self.features_map["environment_state"] = OBS_ENV_STATE
         else:
             super().__post_init__()
+        _join_robot_state(self)
 
     @property
     def gym_kwargs(self) -> dict:
@@ -102,6 +105,18 @@ class LiberoConfig(LiberoEnv, FilmedEnvConfig):
             assets={"libero_assets": physics_hash(assets)},
             control_mode=self.control_mode,
         )
+
+
+def _join_robot_state(config: LiberoEnv) -> None:
+    """Names the robot's state as policies get it. LeRobot's features name its parts; LIBERO's env processor
+    makes one vector of them, and no policy sees a part."""
+    parts = [key for key in config.features if key.startswith(_ROBOT_STATE)]
+    for key in parts:
+        del config.features[key]
+    if parts:
+        given = LiberoProcessorStep().transform_features({})
+        config.features[OBS_STATE] = given[FeatureType.STATE][OBS_STATE]  # ty: ignore[invalid-argument-type]
+        config.features_map[OBS_STATE] = OBS_STATE
 
 
 def _upright(observation: dict[str, Any]) -> np.ndarray:
