@@ -11,21 +11,18 @@ from lerobot_roborecover.study.definition import read_definition, shipped_study
 from lerobot_roborecover.study.evaluate import run_arm, scenario_ids
 from lerobot_roborecover.study.outcomes import outcomes_of, read_outcomes
 
-EVERY = {"metaworld": 32, "metaworld_recovery": 180}
+STUDIES = ("metaworld", "metaworld_recovery", "libero")
+SLICES = (
+    pytest.param("metaworld", 32, marks=pytest.mark.metaworld),
+    pytest.param("metaworld_recovery", 180, marks=pytest.mark.metaworld),
+    pytest.param("libero", 100, marks=pytest.mark.libero),
+)
 """Two of each study's test scenarios: policies from both starts, and all interventions."""
 
 
-@pytest.fixture(scope="module", params=EVERY)
-def name(request):
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def study(name):
-    return read_definition(shipped_study(name))
-
-
-def test_every_trial_of_the_shipped_study_is_stored(study):
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_trial_of_the_shipped_study_is_stored(name):
+    study = read_definition(shipped_study(name))
     stored = read_outcomes(study.outcomes)
     ids = scenario_ids(study, 1)
     arms = {(f"{name}/{start}", n) for name, n in study.policies.items() for start in ("recovery", "initial")}
@@ -52,11 +49,11 @@ def test_a_trial_that_a_bit_decides_comes_out_as_stored(tmp_path):
 
 
 @pytest.mark.lerobot
-@pytest.mark.metaworld
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_a_slice_comes_out_as_stored(name, study, tmp_path, capsys):
-    every = EVERY[name]
+@pytest.mark.parametrize(("name", "every"), SLICES)
+def test_a_slice_comes_out_as_stored(name, every, tmp_path, capsys):
+    study = read_definition(shipped_study(name))
     status = main(["study", "--name", name, "--every", str(every), "--out", str(tmp_path), "--no-report"])
     said = capsys.readouterr().out
     trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
