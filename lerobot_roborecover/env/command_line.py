@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from typing import Any, cast
 
 from lerobot.configs import parser
 
@@ -31,15 +32,23 @@ def process_arguments(program: str, argv: Sequence[str]) -> Generator[None]:
     """Puts arguments in the place of the process's own, which are back afterwards.
 
     LeRobot's parser reads the process's, in several places: `parser.wrap` when a function is called,
-    `parser.get_path_arg` and its like when a configuration is made.
+    `parser.get_path_arg` and its like when a configuration is made. It keeps in its module what a
+    `--config_path` said of policies, where the next configuration of the process would take it for its own.
 
     Args:
         program: the first of them.
         argv: the others.
     """
     before = sys.argv[:]
+    said = cast(list[dict[str, Any]], [parser._config_path_args, parser._config_yaml_overrides])
+    kept = [dict(words) for words in said]
     sys.argv[:] = [program, *argv]
+    for words in said:
+        words.clear()
     try:
         yield
     finally:
         sys.argv[:] = before
+        for words, own in zip(said, kept, strict=True):
+            words.clear()
+            words.update(own)

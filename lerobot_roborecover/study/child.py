@@ -13,6 +13,8 @@ from lerobot_roborecover.workers.parent import end_with_parent
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""
+CANNOT_START = "cannot start "
+"""What `startable` begins a line with that names a run and says why it cannot be begun."""
 
 
 def run_module(module: str, argv: Sequence[str], kernels: Mapping[str, str], log: IO | None = None) -> int:

@@ -16,7 +16,7 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.rounding import has_kernels
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms, report_command
-from lerobot_roborecover.study.child import run_module
+from lerobot_roborecover.study.child import CANNOT_START, run_module
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import (
     STEPS_BAND,
@@ -54,7 +54,7 @@ def evaluate(
     jobs: int = 0,
     say: Callable[[str], None] = print,
 ) -> list[StudyArm]:
-    """Runs every arm that is not finished.
+    """Runs every arm that is not finished, once all of them can start.
 
     Args:
         study: what.
@@ -68,20 +68,21 @@ def evaluate(
         The arms, all finished.
 
     Raises:
-        ScenarioError: an arm failed; the message has the end of its output. Arms under way end first.
+        ScenarioError: an arm cannot start, or failed; the message has the end of its output. Arms under way
+            end first.
     """
     ids = scenario_ids(study, every)
     cores = usable_cores()
     jobs = jobs or cores
     todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
 
+    check_arms([arm for arm in todo if not _finished(arm, ids)], study, out)
+
     def run(arm: StudyArm) -> float:
-        began, done = time.monotonic(), arm.out / DONE_FILE
-        # With other slots the trials are the same: what has finished is not run again for them.
-        same = json.dumps([replace(arm.run, runner={**arm.run.runner, "slots": 0}).config(), ids])
-        if not (done.exists() and done.read_text() == same):
+        began = time.monotonic()
+        if not _finished(arm, ids):
             run_arm(arm, study)
-            done.write_text(same)
+            (arm.out / DONE_FILE).write_text(_what_ran(arm, ids))
         return time.monotonic() - began
 
     with ThreadPoolExecutor(jobs) as pool:
@@ -116,6 +117,30 @@ def write_report(study: StudyDefinition, done: Sequence[StudyArm], out: Path) ->
     )
 
 
+def check_arms(waiting: Sequence[StudyArm], study: StudyDefinition, out: Path) -> None:
+    """Loads what the arms will load, so that one that cannot start is known before the first trial of any.
+
+    Raises:
+        ScenarioError: which cannot, and why.
+    """
+    if not waiting:
+        return
+    for arm in waiting:
+        arm.run.write(arm.out / RUN_FILE)
+    runs = [str(arm.out / RUN_FILE) for arm in waiting]
+    log = out / "trials" / "startable.log"
+    with log.open("wb") as stream:
+        status = run_module("lerobot_roborecover.study.startable", runs, study.environment, stream)
+    if status:
+        lines = log.read_text(errors="replace").splitlines()
+        told = [line for line in lines if line.startswith(CANNOT_START)]
+        shown = "\n".join(f"  {line}" for line in told or lines[-_SHOWN_LINES:])
+        raise ScenarioError(
+            f"not every arm can start, and none was begun ({log} says more):\n{shown}\n"
+            "Put right what is named, and run the same command again"
+        )
+
+
 def run_arm(arm: StudyArm, study: StudyDefinition) -> None:
     """Runs an arm in a process of its own, which rounds as the study says; its output goes into a file.
 
@@ -134,3 +159,13 @@ def run_arm(arm: StudyArm, study: StudyDefinition) -> None:
             f"`roborecover {shlex.join(argv)}` ended with status {status}. The end of {log}:\n"
             f"{shown}\nRun the same command again to go on with what is left"
         )
+
+
+def _finished(arm: StudyArm, ids: Sequence[str]) -> bool:
+    done = arm.out / DONE_FILE
+    return done.exists() and done.read_text() == _what_ran(arm, ids)
+
+
+def _what_ran(arm: StudyArm, ids: Sequence[str]) -> str:
+    # With other slots the trials are the same: what has finished is not run again for them.
+    return json.dumps([replace(arm.run, runner={**arm.run.runner, "slots": 0}).config(), ids])

@@ -16,7 +16,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
 from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition
-from lerobot_roborecover.study.evaluate import compare_with_stored
+from lerobot_roborecover.study.evaluate import compare_with_stored, run_arm
 from lerobot_roborecover.study.make import assemble, chain_for, comes_with_the_package
 from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
 from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
@@ -173,13 +173,27 @@ def test_refusals(study, tmp_path, capsys):
 
 @pytest.mark.lerobot
 @pytest.mark.nightly
-def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path, capsys):
+def test_an_arm_that_cannot_start_is_told_before_the_first_trial_of_any(study, tmp_path, capsys):
+    out = tmp_path / "out"
+    save_policy(study / "correction", "act", action=3)
+    define(study, policies={"act": 1}, interventions=["reversion", "correction"])
+    assert main(["study", "--data", str(study), "--out", str(out), "--no-report"]) == 2
+    message = capsys.readouterr().err
+    (told,) = (line for line in message.splitlines() if "cannot start" in line)
+    assert "correction-recovery/run.yaml: --policy.correction.path=" in told
+    assert "action space is (3,)" in told
+    assert "run the same command again" in message
+    assert not list(out.rglob("trials.jsonl"))
+
+
+@pytest.mark.lerobot
+@pytest.mark.nightly
+def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path):
     define(study, policies={"act": 1}, interventions=[])
     (study / "policies" / "act" / "config.json").write_text("{}")
-    assert main(["study", "--data", str(study), "--out", str(tmp_path / "out"), "--no-report"]) == 2
-    message = capsys.readouterr().err
-    assert "ended with status" in message
-    assert "Run the same command again" in message
+    found = read_definition(study)
+    with pytest.raises(ScenarioError, match=r"(?s)ended with status.*Run the same command again"):
+        run_arm(next(iter(arms(found, tmp_path / "out"))), found)
 
 
 @pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
