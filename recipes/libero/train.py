@@ -34,12 +34,15 @@ POLICIES: dict[str, slice] = {
     "act_pixels": slice(None),
     "act_recover": slice(None),
     "act_recover_large": slice(None),
+    "tdmpc_recover": slice(None),
 }
 """Which of each task's demonstrations a policy learns from, by its name."""
 WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
 """Suites of the policies that see pictures."""
 _SIDE = 64
-WITH_RECOVERIES = dict.fromkeys(("act_recover", "act_recover_large"), ("act_clean", "act_few"))
+WITH_RECOVERIES = dict.fromkeys(
+    ("act_recover", "act_recover_large", "tdmpc_recover"), ("act_clean", "act_few")
+)
 """After whom the expert takes over, in episodes that a policy also learns from."""
 RECOVERIES_PER_TASK = 12
 
@@ -69,8 +72,13 @@ def training(name: str, out: Path, device: str = "cpu") -> Training:
     return Training(CONFIGS / f"{name}.yaml", dataset, out / "train" / name, wanted, device)
 
 
-def make_demonstrations(out: Path, workers: int) -> None:
-    """Writes `out/demonstrations` and `out/pictures`.
+def make_demonstrations(out: Path, workers: int, pictures: bool) -> None:
+    """Writes `out/demonstrations`, and `out/pictures` of the same.
+
+    Args:
+        out: folder to work in.
+        workers: processes.
+        pictures: whether somebody with eyes is to learn.
 
     Raises:
         subprocess.CalledProcessError: one failed; its own output says why.
@@ -78,10 +86,10 @@ def make_demonstrations(out: Path, workers: int) -> None:
     maker = ["recipes.libero.demonstrations", f"--workers={workers}"]
     given = [f"--episodes-per-task={EPISODES_PER_TASK}", f"--parts={out / 'demonstrations.parts'}"]
     suites = sorted({suite for found in WITH_EYES.values() for suite in found})
-    for name, more in {
-        "demonstrations": [],
-        "pictures": [f"--pictures={_SIDE}", "--suites", *suites],
-    }.items():
+    wanted = {"demonstrations": []} | (
+        {"pictures": [f"--pictures={_SIDE}", "--suites", *suites]} if pictures else {}
+    )
+    for name, more in wanted.items():
         if not (out / name).exists():
             program(*maker, *given, f"--out={out / name}", *more)
 
@@ -128,7 +136,7 @@ def main() -> None:
     if not CONFIGS.is_dir():
         parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
     args.out.mkdir(parents=True, exist_ok=True)
-    make_demonstrations(args.out, args.workers)
+    make_demonstrations(args.out, args.workers, pictures=any(name in WITH_EYES for name in args.only))
     for name in args.only:
         if name in WITH_RECOVERIES and not args.print:
             make_recoveries(args.out, WITH_RECOVERIES[name], args.workers)
