@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
+
+from lerobot_roborecover.workers.parent import end_with_parent
 
 
 def program(*words: str | Path) -> None:
-    """Runs a module of this environment.
+    """Runs a module of this environment, ended with the recipe whatever ends that: what it finished is kept,
+    and the same recipe goes on there.
 
     Raises:
         subprocess.CalledProcessError: it failed; its own output says why.
     """
-    subprocess.run([sys.executable, "-m", *map(str, words)], check=True)
+    subprocess.run(
+        [sys.executable, "-m", *map(str, words)], check=True, preexec_fn=partial(end_with_parent, os.getpid())
+    )
 
 
 def roborecover(*words: str | Path) -> None:
