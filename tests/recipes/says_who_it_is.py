@@ -5,4 +5,4 @@ import time
 
 if __name__ == "__main__":
     print(os.getpid(), flush=True)
-    time.sleep(600)
+    time.sleep(300)

@@ -19,4 +19,4 @@ def test_a_command_ends_with_its_recipe(how):
     command = recipe.stdout.readline().strip()
     recipe.send_signal(how)
     assert recipe.wait() == -how
-    assert not alive_after({command})
+    assert not alive_after({command}, seconds=60)
