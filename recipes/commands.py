@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 
-from lerobot_roborecover.workers.parent import end_with_parent
+from lerobot_roborecover.workers.parent import ends_with_this
 
 
 def program(*words: str | Path) -> None:
@@ -19,9 +17,7 @@ def program(*words: str | Path) -> None:
     Raises:
         subprocess.CalledProcessError: it failed; its own output says why.
     """
-    subprocess.run(
-        [sys.executable, "-m", *map(str, words)], check=True, preexec_fn=partial(end_with_parent, os.getpid())
-    )
+    subprocess.run([sys.executable, "-m", *map(str, words)], check=True, preexec_fn=ends_with_this())
 
 
 def roborecover(*words: str | Path) -> None:

@@ -8,14 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
 from lerobot_roborecover.rounding import policy_kernels
 from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
-from lerobot_roborecover.workers.parent import end_with_parent
+from lerobot_roborecover.workers.parent import ends_with_this
 
 _POLL_S = 0.5
 _STOP_S = 10.0
@@ -90,7 +89,7 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
             stderr=subprocess.STDOUT,
             env=environment,
             # A demo that is killed must not leave a run behind that holds the trial log.
-            preexec_fn=partial(end_with_parent, os.getpid()),
+            preexec_fn=ends_with_this(),
         )
         try:
             while process.poll() is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Any, cast
 
 from lerobot.configs import parser
 
@@ -40,15 +39,10 @@ def process_arguments(program: str, argv: Sequence[str]) -> Generator[None]:
         argv: the others.
     """
     before = sys.argv[:]
-    said = cast(list[dict[str, Any]], [parser._config_path_args, parser._config_yaml_overrides])
-    kept = [dict(words) for words in said]
     sys.argv[:] = [program, *argv]
-    for words in said:
-        words.clear()
     try:
         yield
     finally:
         sys.argv[:] = before
-        for words, own in zip(said, kept, strict=True):
-            words.clear()
-            words.update(own)
+        parser._config_path_args.clear()
+        parser._config_yaml_overrides.clear()

@@ -6,10 +6,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import IO
 
-from lerobot_roborecover.workers.parent import end_with_parent
+from lerobot_roborecover.workers.parent import ends_with_this
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""
@@ -32,5 +31,5 @@ def run_module(module: str, argv: Sequence[str], kernels: Mapping[str, str], log
     return subprocess.run(
         [sys.executable, "-m", module, *argv],
         stdin=subprocess.DEVNULL, stdout=log, stderr=None if log is None else subprocess.STDOUT,
-        env={**DEFAULTS, **os.environ, **kernels}, preexec_fn=partial(end_with_parent, os.getpid()),
+        env={**DEFAULTS, **os.environ, **kernels}, preexec_fn=ends_with_this(),
     ).returncode  # fmt: skip

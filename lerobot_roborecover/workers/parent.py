@@ -6,6 +6,8 @@ import ctypes
 import os
 import signal
 import sys
+from collections.abc import Callable
+from functools import partial
 
 _PR_SET_PDEATHSIG = 1
 # Loaded here and not when it is needed: between fork and exec little is safe.
@@ -26,3 +28,8 @@ def end_with_parent(parent: int) -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def ends_with_this() -> Callable[[], None]:
+    """`preexec_fn` of a child that is not to outlive this process."""
+    return partial(end_with_parent, os.getpid())

@@ -140,7 +140,7 @@ def test_an_interrupted_training_goes_on(tmp_path, monkeypatch):
 
     commands = []
 
-    def stopped(command, check):
+    def stopped(command, **_):
         """Trains up to a checkpoint, and is killed unless it goes on from one."""
         commands.append(command[3:])
         folder = tmp_path / "train" / "act"
