@@ -41,10 +41,12 @@ class FramesInMemory:
             for name in table.column_names
         }
         self._pictures = pictures
+        self._cameras = reader._meta.camera_keys
         episodes = reader._meta.episodes
         self._bounds = np.stack([episodes["dataset_from_index"], episodes["dataset_to_index"]], axis=1)
         self._deltas = {key: np.array(steps) for key, steps in (reader.delta_indices or {}).items()}
         self._tasks = list(reader._meta.tasks.index)
+        self._transform = reader._image_transforms
         # Where an episode's frames begin among those that were loaded (all of them, or some episodes').
         loaded = self._columns["index"].numpy()
         self._row_of = np.full(int(loaded.max()) + 1, -1)
@@ -63,6 +65,11 @@ class FramesInMemory:
             batch[key] = self._columns[key][self._row_of[np.clip(wanted, first, end - 1)]]
         for key in self._pictures:
             batch[key] = batch[key].float() / 255
+        if self._transform is not None:
+            # As LeRobot: each frame by itself, its cameras one after the other.
+            for row in range(len(rows)):
+                for key in self._cameras:
+                    batch[key][row] = self._transform(batch[key][row])
         batch["task"] = [self._tasks[task] for task in batch["task_index"]]
         return batch
 

@@ -57,32 +57,40 @@ def test_batches_from_memory_are_the_dataset_s(demonstrations, episodes, monkeyp
                 assert torch.equal(value, other[key]), key
 
 
-def test_pictures_from_memory_are_the_dataset_s(tmp_path):
+@pytest.mark.parametrize("transformed", [False, True])
+def test_pictures_from_memory_are_the_dataset_s(transformed, tmp_path):
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 
     from recipes.frames_in_memory import frames_in_memory
 
+    cameras = ("observation.images.image", "observation.images.image2")
     features = {
-        "observation.images.image": {
-            "dtype": "image",
-            "shape": (8, 8, 3),
-            "names": ["height", "width", "channels"],
+        **{
+            camera: {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"]}
+            for camera in cameras
         },
         "action": {"dtype": "float32", "shape": (2,), "names": None},
     }
     made = LeRobotDataset.create("a/b", 20, features, root=tmp_path / "d", robot_type="x", use_videos=False)
     rng = np.random.default_rng(0)
     for _ in range(5):
-        picture = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
-        made.add_frame({"observation.images.image": picture, "action": np.zeros(2, np.float32), "task": "do"})
+        pictures = {camera: rng.integers(0, 256, (8, 8, 3), dtype=np.uint8) for camera in cameras}
+        made.add_frame({**pictures, "action": np.zeros(2, np.float32), "task": "do"})
     made.save_episode()
     made.finalize()
-    dataset = LeRobotDataset("a/b", root=tmp_path / "d")
+    transforms = ImageTransforms(ImageTransformsConfig(enable=True)) if transformed else None
+    dataset = LeRobotDataset("a/b", root=tmp_path / "d", image_transforms=transforms)
+    plain = next(iter(torch.utils.data.DataLoader(LeRobotDataset("a/b", root=tmp_path / "d"), batch_size=5)))
+    torch.manual_seed(0)
     read = next(iter(torch.utils.data.DataLoader(dataset, batch_size=5)))
+    torch.manual_seed(0)
     with frames_in_memory():
         kept = next(iter(torch.utils.data.DataLoader(dataset, batch_size=5)))
-    assert torch.equal(read["observation.images.image"], kept["observation.images.image"])
+    for camera in cameras:
+        assert torch.equal(read[camera], kept[camera])
+        assert torch.equal(plain[camera], kept[camera]) is not transformed
 
 
 @pytest.mark.parametrize("name", [pytest.param("diffusion_few", marks=pytest.mark.nightly), "tdmpc"])
