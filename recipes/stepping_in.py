@@ -21,6 +21,7 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Scenario
 from recipes.commands import evaluate, roborecover
 from recipes.training import Training
@@ -51,7 +52,7 @@ _METAWORLD = Path("lerobot_roborecover/data/metaworld_study/policies")
 SUBJECTS = {
     "libero": Subject(
         "libero_recovery", _LIBERO / "act_few",
-        (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 30,
+        (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 60,
     ),
     "metaworld": Subject(
         "metaworld_recovery", _METAWORLD / "act",
@@ -82,12 +83,25 @@ class SteppingIn:
     out: Path
     parts: dict[str, list[str]]
 
-    def trials(self, part: str, policy: Path, start: str = "recovery") -> Path:
-        """Log of a policy's trials on a part of the training scenarios, one observation at a time, so that
-        they can be forked."""
+    @property
+    def _watched(self) -> Path:
+        """Where `eval-monitor` keeps trials, and finds those that were forked."""
+        return self.out / "detectors.work"
+
+    def trials(
+        self,
+        part: str,
+        policy: Path,
+        start: str = "recovery",
+        ids: Iterable[str] | None = None,
+        out: Path | None = None,
+    ) -> Path:
+        """Log of a policy's trials on a part of the training scenarios, or on some of it, one observation at a
+        time, so that they can be forked."""
         return evaluate(
-            self.platform, self.subject.scenarios, "train", self.out / "train" / part / policy.name,
-            "--runner.max_batch=1", f"--policy.path={policy}", start=start, ids=self.parts[part],
+            self.platform, self.subject.scenarios, "train",
+            out or self.out / "train" / part / policy.name, "--runner.max_batch=1", f"--policy.path={policy}", start=start,
+            ids=self.parts[part] if ids is None else ids,
         )  # fmt: skip
 
     def correction(self) -> Path:
@@ -99,7 +113,9 @@ class SteppingIn:
         if not (donors / "meta" / "roborecover" / "donors.json").exists():
             # Of a run that was cut short; its trials are kept beside it.
             shutil.rmtree(donors, ignore_errors=True)
-            logs = {policy: self.trials("donors", policy) for policy in (base, *self.subject.donors)}
+            logs = {base: self.trials("donors", base)}
+            lost = [row.scenario_id for row in read_trial_log(logs[base]) if not row.success]
+            logs |= {policy: self.trials("donors", policy, ids=lost) for policy in self.subject.donors}
             named = [
                 word
                 for policy in self.subject.donors
@@ -118,11 +134,13 @@ class SteppingIn:
 
     def forks(self, correction: Path) -> Path:
         """Of the base's trials on the forks' part, from recovery points and from the start."""
-        log = self.trials("forks", self.subject.base)
-        self.trials("forks", self.subject.base, "initial")
+        logs = [
+            self.trials("forks", self.subject.base, start, out=self._watched / f"train-{start}")
+            for start in ("recovery", "initial")
+        ]
         out = self.out / "forks"
         roborecover(
-            "fork", log, "--policy", self.subject.base, "--arm", f"correction:{correction}",
+            "fork", *logs, "--policy", self.subject.base, "--deterministic", "--arm", f"correction:{correction}",
             "--every", str(self.subject.fork_every), "--out", out,
         )  # fmt: skip
         return out
@@ -136,7 +154,7 @@ class SteppingIn:
             "--env", "obs_type=state", *named, "--forks", forks, "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",
             "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA), "--films", "0",
-            "--workers", "2", "--out", out,
+            "--workers", "2", "--work", self._watched, "--out", out,
         )  # fmt: skip
         return out / "detectors"
 

@@ -27,6 +27,8 @@ FORK = "fork"
 """Entry of a row's `options` that says which fork it is."""
 CONTINUE = "continue"
 """The arm in which nobody steps in."""
+MATCHED = "matched"
+"""The random stream of forks that are compared: one new stream for all arms."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ class ForkNote:
     repeat: int
     """Which of the matched random streams."""
     stream: str
-    """`matched`: one new stream for all arms; `own`: the logged trial's goes on."""
+    """`matched`: one new stream for all arms. The others are continuations that check: on `own` the logged
+    trial's stream goes on, and on `another` a policy that is said to be deterministic has a third one; the
+    trial must end as it did."""
 
     def as_json(self) -> dict[str, Any]:
         """For `TrialRow.options`."""
@@ -96,8 +100,7 @@ class ForkGains:
     unpaired: int
     """Forks left out: invalid, or without a valid continuation."""
     reproduced: tuple[int, int]
-    """Of so many continuations on the logged trial's own random stream, how many are its rest, action for
-    action."""
+    """Of so many continuations that check, how many are the logged trial's rest, action for action."""
     unit: ResamplingUnit
 
     @property
@@ -163,7 +166,7 @@ def fork_gains(rows: Iterable[TrialRow], unit: ResamplingUnit | None = None) -> 
         if note is None:
             continue
         platform = row.platform
-        if note.stream == "own":
+        if note.stream != MATCHED:
             checked += 1
             reproduced += row.actions_sha256 == note.actions_sha256
             continue

@@ -45,6 +45,6 @@ def reproduced_text(gains: ForkGains) -> str:
     """Whether continuing gave the logged trials' rest."""
     same, of = gains.reproduced
     return (
-        f"Continued on their own random stream, {same} of {of} logged trials end as they did, action for "
+        f"Continued from their middle to check, {same} of {of} logged trials end as they did, action for "
         "action."
     )

@@ -34,6 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=1,
         help="random streams for each fork, shared by its arms (%(default)s)",
     )
+    add(
+        "--deterministic", action="store_true",
+        help="the policy does the same in every trial: going on is the logged trial, which is not run again "
+        "(one in ten is, to check)",
+    )  # fmt: skip
     add("--correction-steps", type=int, default=30, help="steps of a correction policy (%(default)s)")
     add("--scenarios", default="", help="scenario set of the trials (default: the one that they name)")
     add("--revision", help="commit, tag or branch of that set on the Hub")
@@ -83,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         device=args.device,
         slots=args.slots,
         max_batch=args.max_batch,
+        deterministic=args.deterministic,
     )
     result = run_forks(request, Progress("fork").of)
     for reason, count in result.dropped.most_common():

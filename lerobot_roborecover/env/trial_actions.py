@@ -34,12 +34,22 @@ def keep_actions(folder: Path, trial: Trial, row: TrialRow) -> None:
         trial: it is over.
         row: its row.
     """
-    if not row.steps:
-        return
+    if row.steps:
+        put_actions(folder, trial.actions, row)
+
+
+def put_actions(folder: Path, actions: np.ndarray, row: TrialRow) -> None:
+    """Puts a trial's actions on disk, where they are not there.
+
+    Args:
+        folder: `actions` beside the log; made if need be.
+        actions: (n, A), those of the row.
+        row: the trial's.
+    """
     path = actions_path(folder, row)
     if not path.exists():  # trials may have the same actions
         with new_file(path) as file, open(file, "wb") as stream:
-            np.save(stream, trial.actions, allow_pickle=False)
+            np.save(stream, actions, allow_pickle=False)
 
 
 def read_actions(folder: Path, row: TrialRow) -> np.ndarray:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.fork_gain import CONTINUE, note_of
+from lerobot_roborecover.analysis.fork_gain import CONTINUE, MATCHED, fork_gains, note_of
 from lerobot_roborecover.curation.forks.arms import ForkArm, parse_arm
 from lerobot_roborecover.curation.forks.parents import Choice, LoggedTrial, usable
-from lerobot_roborecover.curation.forks.trial import Fork, ForkTrial, LeadHost
+from lerobot_roborecover.curation.forks.trial import ANOTHER, OWN, Fork, ForkTrial, LeadHost
 from lerobot_roborecover.env.recovery_env import RecoveryEnv
 from lerobot_roborecover.env.trial import actions_digest
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
@@ -152,7 +152,8 @@ def test_streams_are_matched():
     others = {Fork(trial, step, ForkArm("fresh"), repeat=k).stream for step in (4, 5) for k in range(3)}
     assert len(others) == 6
     assert streams < others
-    assert Fork(trial, 4, ForkArm(CONTINUE), own_stream=True).stream is None
+    assert Fork(trial, 4, ForkArm(CONTINUE), on=OWN).stream is None
+    assert Fork(trial, 4, ForkArm(CONTINUE), on=ANOTHER).stream not in {None, *others}
 
 
 def test_which_trials_and_which_steps():
@@ -224,6 +225,32 @@ def forked(policies, logs, kind, out, arms=(), **options):
     return run_forks(request)
 
 
+MEASURED = {"finished_at", "handoff_s", "sim_s", "policy_s", "handoff_from_snapshot"}
+
+
+@pytest.mark.lerobot
+@pytest.mark.slow
+def test_a_deterministic_policys_continuations_are_taken_from_the_log(policies, logs, tmp_path):
+    """As they would be if they had been run; one that is continued to check says whether that is so."""
+    run = forked(policies, logs, "act", tmp_path / "run", ["fresh"])
+    taken = forked(policies, logs, "act", tmp_path / "taken", ["fresh"], deterministic=True)
+
+    def plain(found):
+        rows = sorted((r for r in found.rows if note_of(r).stream == MATCHED), key=lambda r: r.key())
+        return [{k: v for k, v in asdict(r).items() if k not in MEASURED} for r in rows]
+
+    assert plain(taken) == plain(run)
+    assert fork_gains(taken.rows).reproduced == (1, 1)
+    assert len(read_trial_log(taken.log)) == len(taken.rows) == 8 + 1 + 8
+    for row in taken.rows:
+        assert len(read_actions(taken.log.with_name(ACTIONS_FOLDER), row)) >= row.steps
+    again = forked(policies, logs, "act", tmp_path / "taken", ["fresh"], deterministic=True)
+    assert again.rows == taken.rows
+    # A policy that draws is found out, whatever its own random stream repeats.
+    drawn = forked(policies, logs, "diffusion", tmp_path / "drawn", ["fresh"], deterministic=True)
+    assert fork_gains(drawn.rows).reproduced == (0, 1)
+
+
 @pytest.mark.lerobot
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
@@ -232,15 +259,13 @@ def test_continuing_reproduces_the_rest_of_the_trial(policies, logs, kind, tmp_p
     queue and draws noise as well as one that does not. Row and actions are the parent's."""
     from lerobot_roborecover.curation.forks import run
 
-    def own(parents, arm, choice, repeats):
-        return [Fork(p, step, arm, own_stream=True) for p in parents for step in choice.steps(p)]
+    def own(parents, arm, request):
+        return [Fork(p, step, arm, on=OWN) for p in parents for step in request.choice.steps(p)]
 
     monkeypatch.setattr(run, "forks_of", own)
     found = forked(policies, logs, kind, tmp_path)
     assert len(found.rows) == 8
-    apart = {
-        "options", "config_hash", "finished_at", "handoff_s", "sim_s", "policy_s", "handoff_from_snapshot"
-    }  # fmt: skip
+    apart = {"options", "config_hash", *MEASURED}
     for row in found.rows:
         logged = logs[kind][1][row.scenario_id].row
         assert {k: v for k, v in asdict(row).items() if k not in apart} == {

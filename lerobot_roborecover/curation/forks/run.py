@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_roborecover.analysis.fork_gain import CONTINUE, FORK
+from lerobot_roborecover.analysis.fork_gain import CONTINUE, FORK, MATCHED
 from lerobot_roborecover.curation.forks.arms import ForkArm
 from lerobot_roborecover.curation.forks.parents import Choice, LoggedTrial, rows_of, usable, with_actions
-from lerobot_roborecover.curation.forks.trial import Fork, ForkRun, LeadHost
+from lerobot_roborecover.curation.forks.trial import ANOTHER, OWN, Fork, ForkRun, LeadHost
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, env_config
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.run import Run, open_run
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 _FREE = ("rewind_rule", FORK)
 """Options of a row that a fork takes from it, and not from the environment."""
+_CHECKED = 10
+"""Of a deterministic policy's trials one in so many is continued to check that it is."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,9 @@ class ForkRequest:
     slots: int = 0
     max_batch: int = 1
     """Observations per inference; more than one changes the last bits of a policy's actions."""
+    deterministic: bool = False
+    """Whether the policy does the same in every trial: going on is then the rest of the logged trial, which
+    is taken from the log."""
 
     def __post_init__(self):
         if not 1 <= self.repeats <= 10_000:
@@ -121,14 +126,16 @@ def run_forks(
     return ForkResult(request.out / TRIALS_FILE, tuple(found), len(parents), dropped)
 
 
-def forks_of(parents: Sequence[LoggedTrial], arm: ForkArm, choice: Choice, repeats: int) -> list[Fork]:
-    """The forks of an arm; of each trial that continues, one more on its own random stream, in its middle."""
+def forks_of(parents: Sequence[LoggedTrial], arm: ForkArm, request: ForkRequest) -> list[Fork]:
+    """The forks of an arm; of each trial that continues, one more that checks, in its middle: on its own random
+    stream, or of one in ten of a deterministic policy's on another."""
     found = []
-    for parent in parents:
-        steps = choice.steps(parent)
-        found += [Fork(parent, step, arm, k) for step in steps for k in range(repeats)]
-        if arm.leads and steps:
-            found.append(Fork(parent, steps[len(steps) // 2], arm, own_stream=True))
+    for number, parent in enumerate(parents):
+        steps = request.choice.steps(parent)
+        found += [Fork(parent, step, arm, k) for step in steps for k in range(request.repeats)]
+        if arm.leads and steps and not (request.deterministic and number % _CHECKED):
+            on = ANOTHER if request.deterministic else OWN
+            found.append(Fork(parent, steps[len(steps) // 2], arm, on=on))
     return found
 
 
@@ -148,12 +155,17 @@ def _run_arm(
         shared.protocol, policy=facts.policy, execution_horizon=facts.execution_horizon, options=options,
         run_seed=parents[0].row.run_seed,
     )  # fmt: skip
-    forks = forks_of(parents, arm, request.choice, request.repeats)
+    forks = forks_of(parents, arm, request)
     of_run: dict[str, Any] = {f.name: getattr(shared, f.name) for f in fields(Run)}
     of_run |= {"protocol": protocol, "intervention": facts.intervention}
     run = ForkRun(**of_run, forks=forks)
     units = [Unit(fork.parent.scenario, k) for k, fork in enumerate(forks)]
     todo = unfinished(run, units)
+    if request.deterministic and arm.leads:
+        rest = [forks[unit.trial] for unit in todo if forks[unit.trial].on == MATCHED]
+        for fork in rest:
+            run.take_rest(fork)
+        todo = unfinished(run, units) if rest else todo
     done = [len(units) - len(todo)]
     on_fork(arm.kind, done[0], len(units))
 

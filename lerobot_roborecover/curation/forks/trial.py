@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import FORK, ForkNote
+from lerobot_roborecover.analysis.fork_gain import FORK, MATCHED, ForkNote
 from lerobot_roborecover.curation.forks.arms import ForkArm
 from lerobot_roborecover.curation.forks.parents import LoggedTrial
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, GoBack, StartsTrials, Trial
-from lerobot_roborecover.env.trial_row import Protocol, trial_seed
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, put_actions
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow, trial_seed
 from lerobot_roborecover.policies.host import Chunk, Host, PolicyError
 from lerobot_roborecover.scenario import Start, TrialStart
 from lerobot_roborecover.workers.messages import EpisodeSpec
@@ -31,6 +32,8 @@ from lerobot_roborecover.workers.messages import EpisodeSpec
 SAME_ACTION = 1e-4
 """How far an action may be from the logged one where the policy is led through a trial: what a batch of
 another size changes (docs/policies.md)."""
+OWN, ANOTHER = "own", "another"
+"""Random streams of continuations that check (`ForkNote.stream`)."""
 
 
 @dataclass(frozen=True)
@@ -42,23 +45,22 @@ class Fork:
     """New steps of the parent before it."""
     arm: ForkArm
     repeat: int = 0
-    own_stream: bool = False
-    """Whether the parent's random stream goes on, which reproduces the rest of the parent; otherwise all arms
-    of a repeat draw from one new stream."""
+    on: str = MATCHED
+    """Which random stream (`ForkNote.stream`)."""
 
     @property
     def stream(self) -> int | None:
         """Seed of the new stream; the same for all arms. None where the parent's goes on."""
-        if self.own_stream:
+        if self.on == OWN:
             return None
         row = self.parent.row
-        return trial_seed(row.run_seed, f"{row.scenario_id}/{row.trial}/{self.step}", self.repeat)
+        repeat = self.repeat if self.on == MATCHED else -1
+        return trial_seed(row.run_seed, f"{row.scenario_id}/{row.trial}/{self.step}", repeat)
 
     def note(self) -> ForkNote:
         """What its row says of it."""
         row = self.parent.row
-        stream = "own" if self.own_stream else "matched"
-        return ForkNote(row.config_hash, row.actions_sha256, self.step, self.arm.label, self.repeat, stream)
+        return ForkNote(row.config_hash, row.actions_sha256, self.step, self.arm.label, self.repeat, self.on)
 
     def protocol(self, shared: Protocol) -> Protocol:
         """That of its trial.
@@ -232,3 +234,12 @@ class ForkRun(Run):
             action_width=self.action_width(scenario),
             handoff_check=self.handoff_check,
         )
+
+    def take_rest(self, fork: Fork) -> TrialRow:
+        """The row of a continuation that is the rest of the logged trial, on disk with its actions, as it
+        would be if the policy, which is deterministic, had run again."""
+        protocol, log, row = fork.protocol(self.protocol), self.kept_log(), fork.parent.row
+        row = replace(row, options=dict(protocol.options), config_hash=protocol.config_hash())
+        put_actions(log.path.with_name(ACTIONS_FOLDER), fork.parent.actions, row)
+        log.append(row)
+        return row

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import note_of
+from lerobot_roborecover.analysis.fork_gain import MATCHED, note_of
 from lerobot_roborecover.curation.monitor_data.choice import from_rollouts
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
@@ -98,7 +98,7 @@ def _why_not(row: TrialRow, scenario: Scenario | None, of: str) -> str:
     if of != "all" and row.success != (of == "successes"):
         return f"not among the {of} (--of)"
     note = note_of(row)
-    if note is not None and note.stream == "own":
+    if note is not None and note.stream != MATCHED:
         return "a fork that only repeats its trial"
     mode = row.options.get("control_mode")
     if mode not in (None, platform_named(row.platform).records_control_mode):
