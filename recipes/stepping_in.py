@@ -96,11 +96,12 @@ class SteppingIn:
         ids: Iterable[str] | None = None,
         out: Path | None = None,
     ) -> Path:
-        """Log of a policy's trials on a part of the training scenarios, or on some of it, one observation at a
-        time, so that they can be forked."""
+        """Log of a policy's trials on a part of the training scenarios, or on some of it, one observation at
+        a time, so that they can be forked."""
         return evaluate(
             self.platform, self.subject.scenarios, "train",
-            out or self.out / "train" / part / policy.name, "--runner.max_batch=1", f"--policy.path={policy}", start=start,
+            out or self.out / "train" / part / policy.name,
+            "--runner.max_batch=1", f"--policy.path={policy}", start=start,
             ids=self.parts[part] if ids is None else ids,
         )  # fmt: skip
 
@@ -140,8 +141,8 @@ class SteppingIn:
         ]
         out = self.out / "forks"
         roborecover(
-            "fork", *logs, "--policy", self.subject.base, "--deterministic", "--arm", f"correction:{correction}",
-            "--every", str(self.subject.fork_every), "--out", out,
+            "fork", *logs, "--policy", self.subject.base, "--deterministic",
+            "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every), "--out", out,
         )  # fmt: skip
         return out
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,76 +23,120 @@ from recipes.commands import program
 from recipes.libero.demonstrations import part_of, tasks_of, write_dataset
 from recipes.training import Training
 
-EPISODES_PER_TASK = 16
-"""Every second one is clean, the others are shaken."""
 CONFIGS = Path("policies/train/libero")
-POLICIES: dict[str, slice] = {
-    "act": slice(None),
-    "act_clean": slice(None, None, 2),
-    "act_few": slice(4),
-    "diffusion": slice(None),
-    "tdmpc": slice(None),
-    "act_pixels": slice(None),
-    "act_recover": slice(None),
-    "act_recover_large": slice(None),
-    "tdmpc_recover": slice(None),
-}
-"""Which of each task's demonstrations a policy learns from, by its name."""
-WITH_EYES = {"act_pixels": ("libero_spatial", "libero_object")}
-"""Suites of the policies that see pictures."""
 _SIDE = 64
-WITH_RECOVERIES = dict.fromkeys(
-    ("act_recover", "act_recover_large", "tdmpc_recover"), ("act_clean", "act_few")
-)
-"""After whom the expert takes over, in episodes that a policy also learns from."""
+"""Of pictures, in pixels."""
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Which demonstrations a policy learns from. Every second one is clean, the others are shaken."""
+
+    taken: slice = slice(None)
+    """Of each task's."""
+    suites: tuple[str, ...] = ()
+    """Empty: all."""
+    per_task: int = 16
+    pictures: bool = False
+    """In place of the privileged numbers."""
+    after: tuple[str, ...] = ()
+    """Policies of the clone (`policies/libero`) after which the expert takes over, in episodes that are
+    learned from, too."""
+
+    @property
+    def parts(self) -> str:
+        """Folder of the tasks' demonstrations."""
+        return "demonstrations.parts" if self.per_task == 16 else f"demonstrations{self.per_task}.parts"
+
+    @property
+    def dataset(self) -> str:
+        """Folder of the dataset."""
+        if self.after:
+            return "with_recoveries"
+        which = [*self.suites, *(["pictures"] if self.pictures else [])]
+        return "-".join([self.parts.removesuffix(".parts"), *which])
+
+
+_ALL = Lessons()
+_RECOVERIES = Lessons(after=("act_clean", "act_few"))
+POLICIES: dict[str, Lessons] = {
+    "act": _ALL,
+    "act_clean": Lessons(slice(None, None, 2)),
+    "act_few": Lessons(slice(4)),
+    "diffusion": _ALL,
+    "tdmpc": Lessons(suites=("libero_object", "libero_goal")),
+    "act_pixels": Lessons(suites=("libero_object",), per_task=32, pictures=True),
+    "act_recover": _RECOVERIES,
+    "act_recover_large": _RECOVERIES,
+}
 RECOVERIES_PER_TASK = 12
 
 
-def episodes(name: str, parts: Path) -> list[int] | None:
+def episodes(lessons: Lessons, parts: Path) -> list[int] | None:
     """The demonstrations a policy learns from, as `--dataset.episodes` wants them; None: all.
 
     Args:
-        name: of the policy.
+        lessons: of the policy.
         parts: folder of the tasks' demonstrations, some of which may be fewer than others.
     """
-    if POLICIES[name] == slice(None):
+    if lessons.taken == slice(None):
         return None
     numbers, first = [], 0
-    for task in tasks_of(WITH_EYES.get(name)):
+    for task in tasks_of(lessons.suites):
         count = len(np.load(part_of(parts, task))["lengths"])
-        numbers += [first + n for n in range(count)[POLICIES[name]]]
+        numbers += [first + n for n in range(count)[lessons.taken]]
         first += count
     return numbers
 
 
 def training(name: str, out: Path, device: str = "cpu") -> Training:
     """A policy's training, in `out/train`."""
-    kind = "pictures" if name in WITH_EYES else "demonstrations"
-    dataset = out / ("with_recoveries" if name in WITH_RECOVERIES else kind)
-    wanted = episodes(name, out / "demonstrations.parts")
-    return Training(CONFIGS / f"{name}.yaml", dataset, out / "train" / name, wanted, device)
+    lessons = POLICIES[name]
+    wanted = episodes(lessons, out / lessons.parts)
+    options = (f"--policy.path={_beginning(name, out)}",) if lessons.pictures else ()
+    return Training(
+        CONFIGS / f"{name}.yaml", out / lessons.dataset, out / "train" / name, wanted, device, options
+    )
 
 
-def make_demonstrations(out: Path, workers: int, pictures: bool) -> None:
-    """Writes `out/demonstrations`, and `out/pictures` of the same.
+def _beginning(name: str, out: Path) -> Path:
+    """The untrained policy whose training goes on, of one that sees pictures."""
+    return out / "beginnings" / name
+
+
+def make_beginning(name: str, out: Path) -> None:
+    """Writes the untrained policy, its backbone calibrated on its pictures, if it is not there.
+
+    Raises:
+        subprocess.CalledProcessError: it failed; its own output says why.
+    """
+    where = _beginning(name, out)
+    if not where.exists():
+        program(
+            "recipes.calibrated_backbone", f"--config_path={CONFIGS / name}.yaml",
+            f"--dataset.root={out / POLICIES[name].dataset}", f"--output_dir={where}",
+        )  # fmt: skip
+
+
+def make_demonstrations(out: Path, lessons: Lessons, workers: int) -> None:
+    """Writes a policy's dataset of demonstrations, if it is not there.
 
     Args:
         out: folder to work in.
+        lessons: of the policy.
         workers: processes.
-        pictures: whether somebody with eyes is to learn.
 
     Raises:
         subprocess.CalledProcessError: one failed; its own output says why.
     """
-    maker = ["recipes.libero.demonstrations", f"--workers={workers}"]
-    given = [f"--episodes-per-task={EPISODES_PER_TASK}", f"--parts={out / 'demonstrations.parts'}"]
-    suites = sorted({suite for found in WITH_EYES.values() for suite in found})
-    wanted = {"demonstrations": []} | (
-        {"pictures": [f"--pictures={_SIDE}", "--suites", *suites]} if pictures else {}
-    )
-    for name, more in wanted.items():
-        if not (out / name).exists():
-            program(*maker, *given, f"--out={out / name}", *more)
+    lessons = replace(lessons, after=())
+    if not (out / lessons.dataset).exists():
+        program(
+            "recipes.libero.demonstrations", f"--workers={workers}",
+            f"--episodes-per-task={lessons.per_task}", f"--parts={out / lessons.parts}",
+            f"--out={out / lessons.dataset}", *([f"--pictures={_SIDE}"] if lessons.pictures else []),
+            *(["--suites", *lessons.suites] if lessons.suites else []),
+        )  # fmt: skip
 
 
 def make_recoveries(out: Path, after: Sequence[str], workers: int) -> None:
@@ -136,10 +181,13 @@ def main() -> None:
     if not CONFIGS.is_dir():
         parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
     args.out.mkdir(parents=True, exist_ok=True)
-    make_demonstrations(args.out, args.workers, pictures=any(name in WITH_EYES for name in args.only))
     for name in args.only:
-        if name in WITH_RECOVERIES and not args.print:
-            make_recoveries(args.out, WITH_RECOVERIES[name], args.workers)
+        lessons = POLICIES[name]
+        make_demonstrations(args.out, lessons, args.workers)
+        if lessons.after and not args.print:
+            make_recoveries(args.out, lessons.after, args.workers)
+        if lessons.pictures and not args.print:
+            make_beginning(name, args.out)
         wanted, result = training(name, args.out, args.device), args.out / "policies" / name
         if args.print:
             print(shlex.join(["lerobot-train", *wanted.arguments()]))

@@ -38,14 +38,14 @@ def test_every_config_is_a_policy_s(tmp_path):
 
 def test_a_policy_learns_from_its_share_of_every_task_whatever_there_is_of_it(tmp_path):
     from recipes.libero.demonstrations import part_of, tasks_of
-    from recipes.libero.train import episodes
+    from recipes.libero.train import POLICIES, episodes
 
     counts = [0, 16, 3] + [16] * 37
     for task, count in zip(tasks_of(None), counts, strict=True):
         np.savez(part_of(tmp_path, task), lengths=np.full(count, 9))
-    assert episodes("act", tmp_path) is None
-    assert episodes("act_few", tmp_path)[:8] == [0, 1, 2, 3, 16, 17, 18, 19]
-    assert episodes("act_clean", tmp_path)[:11] == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 19]
+    assert episodes(POLICIES["act"], tmp_path) is None
+    assert episodes(POLICIES["act_few"], tmp_path)[:8] == [0, 1, 2, 3, 16, 17, 18, 19]
+    assert episodes(POLICIES["act_clean"], tmp_path)[:11] == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 19]
 
 
 SHIPPED = ROOT / "policies" / "libero"

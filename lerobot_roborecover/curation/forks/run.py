@@ -127,8 +127,8 @@ def run_forks(
 
 
 def forks_of(parents: Sequence[LoggedTrial], arm: ForkArm, request: ForkRequest) -> list[Fork]:
-    """The forks of an arm; of each trial that continues, one more that checks, in its middle: on its own random
-    stream, or of one in ten of a deterministic policy's on another."""
+    """The forks of an arm; of each trial that continues, one more that checks, in its middle: on its own
+    random stream, or of one in ten of a deterministic policy's on another."""
     found = []
     for number, parent in enumerate(parents):
         steps = request.choice.steps(parent)
