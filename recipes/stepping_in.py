@@ -83,6 +83,10 @@ class SteppingIn:
     out: Path
     parts: dict[str, list[str]]
 
+    def _snapshots(self, head: str = "") -> str:
+        """The option that shares handoffs among policies: each is replayed once."""
+        return f"{head}snapshot_dir={self.out / 'snapshots'}"
+
     @property
     def _watched(self) -> Path:
         """Where `eval-monitor` keeps trials, and finds those that were forked."""
@@ -101,7 +105,7 @@ class SteppingIn:
         return evaluate(
             self.platform, self.subject.scenarios, "train",
             out or self.out / "train" / part / policy.name,
-            "--runner.max_batch=1", f"--policy.path={policy}", start=start,
+            self._snapshots("--env."), "--runner.max_batch=1", f"--policy.path={policy}", start=start,
             ids=self.parts[part] if ids is None else ids,
         )  # fmt: skip
 
@@ -142,7 +146,8 @@ class SteppingIn:
         out = self.out / "forks"
         roborecover(
             "fork", *logs, "--policy", self.subject.base, "--deterministic",
-            "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every), "--out", out,
+            "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every),
+            "--env", self._snapshots(), "--out", out,
         )  # fmt: skip
         return out
 
@@ -152,7 +157,8 @@ class SteppingIn:
         named = [word for name, what in DETECTORS.items() for word in ("--detector", f"{name}={what}")]
         roborecover(
             "eval-monitor", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
-            "--env", "obs_type=state", *named, "--forks", forks, "--split", "train",
+            "--env", "obs_type=state", "--env", self._snapshots(), *named, "--forks", forks,
+            "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",
             "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA), "--films", "0",
             "--workers", "2", "--work", self._watched, "--out", out,
@@ -163,7 +169,8 @@ class SteppingIn:
         """One arm on the test scenarios, as `roborecover report` takes it."""
         log = evaluate(
             self.platform, self.subject.scenarios, "test", self.out / "test" / name,
-            "--policy.type=roborecover_intervention", f"--policy.base.path={self.subject.base}", *options,
+            self._snapshots("--env."), "--policy.type=roborecover_intervention",
+            f"--policy.base.path={self.subject.base}", *options,
         )  # fmt: skip
         return f"{name}={log}"
 
