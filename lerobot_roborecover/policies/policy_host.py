@@ -259,7 +259,9 @@ class PolicyHost:
         return self._pre(self.env_batch(observations, instructions))
 
     def _actions(self, action: torch.Tensor) -> np.ndarray:
-        return self._env_post({ACTION: self._post(action)})[ACTION].to("cpu").numpy()
+        action = self._env_post({ACTION: self._post(action)})[ACTION].to("cpu")
+        # What a processor computes under `use_amp`, which NumPy has no type for.
+        return (action.float() if action.dtype is torch.bfloat16 else action).numpy()
 
     # --- random streams
 

@@ -10,7 +10,8 @@ from pathlib import Path
 def ship(checkpoint: Path, out: Path) -> None:
     """Copies a trained policy in half precision, for a CPU, without the training's settings and places.
 
-    LeRobot loads the weights into float32 again.
+    LeRobot loads the weights into float32 again, and infers in it: mixed precision, with which a policy may
+    have been trained, gives bfloat16 on a CPU, which `lerobot-eval` cannot hand to a simulator.
 
     Args:
         checkpoint: a `pretrained_model` folder.
@@ -27,7 +28,11 @@ def ship(checkpoint: Path, out: Path) -> None:
             save_file(half, out / file.name, metadata={"format": "pt"})
         elif file.name == "config.json":
             # Which folder training went on from is a place of the machine that trained.
-            config = json.loads(file.read_text()) | {"device": "cpu", "pretrained_path": None}
+            config = json.loads(file.read_text()) | {
+                "device": "cpu",
+                "pretrained_path": None,
+                "use_amp": False,
+            }
             (out / file.name).write_text(json.dumps(config, indent=4))
         elif file.suffix == ".json" and file.name != "train_config.json":
             (out / file.name).write_text(file.read_text().replace('"device": "cuda"', '"device": "cpu"'))

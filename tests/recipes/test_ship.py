@@ -33,7 +33,7 @@ def test_ship(tmp_path):
     made = tmp_path / "pretrained_model"
     made.mkdir()
     save_file({"w": torch.ones(2), "n": torch.ones(2, dtype=torch.int64)}, made / "model.safetensors")
-    config = {"type": "act", "device": "cuda", "pretrained_path": "/home/somebody/act", "chunk_size": 8}
+    config = {"type": "act", "device": "cuda", "pretrained_path": "/home/somebody/act", "use_amp": True}
     (made / "config.json").write_text(json.dumps(config))
     (made / "policy_preprocessor.json").write_text('{"device": "cuda"}')
     (made / "train_config.json").write_text("{}")
@@ -41,7 +41,7 @@ def test_ship(tmp_path):
     shipped = {path.name for path in (tmp_path / "out").iterdir()}
     assert shipped == {"model.safetensors", "config.json", "policy_preprocessor.json"}
     found = json.loads((tmp_path / "out" / "config.json").read_text())
-    assert found == config | {"device": "cpu", "pretrained_path": None}
+    assert found == config | {"device": "cpu", "pretrained_path": None, "use_amp": False}
     assert json.loads((tmp_path / "out" / "policy_preprocessor.json").read_text()) == {"device": "cpu"}
     weights = load_file(tmp_path / "out" / "model.safetensors")
     assert (weights["w"].dtype, weights["n"].dtype) == (torch.float16, torch.int64)

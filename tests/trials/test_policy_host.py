@@ -136,6 +136,17 @@ def test_a_batch_gives_each_slot_what_it_gets_alone(checkpoints):
         assert actions.shape == (4, 2)
 
 
+def test_mixed_precision_on_a_cpu_gives_actions_that_numpy_has(checkpoints):
+    """bfloat16, as float32."""
+    plain, mixed = (
+        ask(host_of(checkpoints["act"], "act", use_amp=amp), [5], [observation_of(0)], rounds=1)[0]
+        for amp in (False, True)
+    )
+    assert mixed.dtype == plain.dtype == np.float32
+    assert np.allclose(mixed, plain, atol=0.05)
+    assert not np.array_equal(mixed, plain)
+
+
 def test_weights_are_shared_and_histories_are_not(checkpoints):
     host = host_of(checkpoints["diffusion"], "diffusion")
     one, two = host.start(1), host.start(2)
