@@ -52,7 +52,7 @@ _METAWORLD = Path("lerobot_roborecover/data/metaworld_study/policies")
 SUBJECTS = {
     "libero": Subject(
         "libero_recovery", _LIBERO / "act_few",
-        (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 60,
+        (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 90,
     ),
     "metaworld": Subject(
         "metaworld_recovery", _METAWORLD / "act",
