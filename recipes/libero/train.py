@@ -64,7 +64,7 @@ POLICIES: dict[str, Lessons] = {
     "act_clean": Lessons(slice(None, None, 2)),
     "act_few": Lessons(slice(4)),
     "diffusion": _ALL,
-    "tdmpc": Lessons(suites=("libero_object", "libero_goal")),
+    "tdmpc": Lessons(suites=("libero_object",), per_task=32),
     "act_pixels": Lessons(suites=("libero_object",), per_task=32, pictures=True),
     "act_recover": _RECOVERIES,
     "act_recover_large": _RECOVERIES,
