@@ -53,28 +53,45 @@ SHIPPED = ROOT / "policies" / "libero"
 
 def test_the_policies_in_the_clone_are_small_and_say_what_they_need():
     from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
+    from recipes.libero.demonstrations import CAMERAS
     from recipes.libero.train import POLICIES
 
     names = {path.name for path in SHIPPED.iterdir()}
     assert {"act", "diffusion"} < names <= set(POLICIES)
     for name in names:
-        assert (SHIPPED / name / "model.safetensors").stat().st_size < 10e6, name
+        pictures = POLICIES[name].pictures
+        assert (SHIPPED / name / "model.safetensors").stat().st_size < (30e6 if pictures else 10e6), name
         config = json.loads((SHIPPED / name / "config.json").read_text())
         assert config["device"] == "cpu"
         shapes = {key: feature["shape"] for key, feature in config["input_features"].items()}
-        assert shapes == {
-            "observation.state": [8], "observation.environment_state": [ENVIRONMENT_STATE_DIM]
-        }  # fmt: skip
+        seen = (
+            {f"observation.images.{camera}": [3, 64, 64] for camera in CAMERAS}
+            if pictures
+            else {"observation.environment_state": [ENVIRONMENT_STATE_DIM]}
+        )
+        assert shapes == {"observation.state": [8]} | seen
+
+
+STATE = ("--env.obs_type=state",)
+PICTURES = (
+    "--env.render_quality=fast", "--env.observation_height=64", "--env.observation_width=64"
+)  # fmt: skip
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("name", ["act", "act_few", "diffusion"])
-def test_a_policy_of_the_clone_solves_starts(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "looks"),
+    [
+        ("act", STATE), ("act_few", STATE), ("diffusion", STATE),
+        pytest.param("act_pixels", PICTURES, marks=pytest.mark.render),
+    ],
+)  # fmt: skip
+def test_a_policy_of_the_clone_solves_starts(name, looks, tmp_path):
     """Two of three easy ones: another processor may round a rollout the other way."""
     from lerobot_roborecover.cli.main import main
     from recipes.libero.initial_success import count, table
 
-    given = ["--env.type=roborecover_libero", "--env.obs_type=state", f"--policy.path={SHIPPED / name}"]
+    given = ["--env.type=roborecover_libero", *looks, f"--policy.path={SHIPPED / name}"]
     starts = ["--task=libero_object/*butter*", "--task=libero_object/*milk*", "--task=libero_object/*salad*"]
     out = ["--init-states=0", "--frames=none", f"--name={name}", f"--out={tmp_path / name}"]
     main(["collect", *given, *starts, *out])  # where all are solved, it has nothing to write
