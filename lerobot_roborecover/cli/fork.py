@@ -98,4 +98,11 @@ def run(args: argparse.Namespace) -> int:
     print("\n\n".join(f"{table.title}\n{to_text(table)}" for table in tables[:3]))
     print(f"\n{reproduced_text(gains)}\nlog {result.log}\npage {args.out / PAGE}")
     same, of = gains.reproduced
+    if same != of and args.deterministic:
+        print(
+            f"error: {args.policy} is said to be deterministic, and {of - same} of {of} of its trials end "
+            "otherwise on another random stream: what is above is wrong. Leave out --deterministic, and name "
+            "another --out",
+            file=sys.stderr,
+        )
     return 0 if same == of else 1

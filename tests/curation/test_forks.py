@@ -230,8 +230,10 @@ MEASURED = {"finished_at", "handoff_s", "sim_s", "policy_s", "handoff_from_snaps
 
 @pytest.mark.lerobot
 @pytest.mark.slow
-def test_a_deterministic_policys_continuations_are_taken_from_the_log(policies, logs, tmp_path):
+def test_a_deterministic_policys_continuations_are_taken_from_the_log(policies, logs, tmp_path, capsys):
     """As they would be if they had been run; one that is continued to check says whether that is so."""
+    from lerobot_roborecover.cli.main import main
+
     run = forked(policies, logs, "act", tmp_path / "run", ["fresh"])
     taken = forked(policies, logs, "act", tmp_path / "taken", ["fresh"], deterministic=True)
 
@@ -247,8 +249,15 @@ def test_a_deterministic_policys_continuations_are_taken_from_the_log(policies, 
     again = forked(policies, logs, "act", tmp_path / "taken", ["fresh"], deterministic=True)
     assert again.rows == taken.rows
     # A policy that draws is found out, whatever its own random stream repeats.
-    drawn = forked(policies, logs, "diffusion", tmp_path / "drawn", ["fresh"], deterministic=True)
-    assert fork_gains(drawn.rows).reproduced == (0, 1)
+    command = [
+        "fork",
+        str(logs["diffusion"][0]),
+        f"--policy={policies['diffusion']}",
+        "--at=0,6",
+        "--slots=2",
+    ]
+    assert main([*command, f"--out={tmp_path / 'drawn'}", "--arm=fresh", "--deterministic"]) == 1
+    assert "1 of 1 of its trials end otherwise" in capsys.readouterr().err
 
 
 @pytest.mark.lerobot
