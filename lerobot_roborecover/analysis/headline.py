@@ -35,6 +35,12 @@ def headline(results: Results) -> str:
         sentences.append(_method(results, name))
     if not results.compared.complete:
         sentences.append(_who(results))
+    if results.lacking:
+        sentences.append(
+            "Incomplete: "
+            + ", ".join(f"{results.recovery.arms[p]} ({lack})" for p, lack in results.lacking.items())
+            + "."
+        )
     rivals = [results.ranked.arms[p] for p in results.best_first[1:]]
     if rivals:
         sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))

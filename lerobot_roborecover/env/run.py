@@ -200,6 +200,7 @@ def open_run(
         policy=facts.policy,
         run_seed=None,
         execution_horizon=facts.execution_horizon,
+        policy_settings=facts.policy_settings,
         options=decisive,
         versions={name: installed(name) or "" for name in required(platform)},
     )
@@ -209,6 +210,8 @@ def open_run(
         "RoboRecover: %d scenarios of %s%s from %s; trial log %s (%d rows already there)",
         len(scenarios), scenarios.source, trials, start.value, log.path, len(log),
     )  # fmt: skip
+    for remark in log.other_rows(protocol):
+        logger.warning("%s", remark)
     if log.dropped_bytes:
         logger.warning("dropped a last line of %d bytes that a crash had cut off", log.dropped_bytes)
     folder, shared = options.snapshot_dir, None

@@ -190,7 +190,13 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             "--videos=N for films"
         )
     out = cfg.folder
-    facts = facts_of(policy, n_episodes=cfg.eval.n_episodes, output_dir=out)
+    facts = facts_of(
+        policy,
+        rename_map=cfg.rename_map,
+        portable=cfg.runner.portable,
+        n_episodes=cfg.eval.n_episodes,
+        output_dir=out,
+    )
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
