@@ -24,6 +24,7 @@ from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
@@ -137,6 +138,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     remarks += _revisions(kept, found)
     remarks += _render_qualities(kept)
     remarks += _clocks(kept)
+    remarks += _unknown_weights(kept)
     remarks += _check_versions(kept)
     check_runs(kept, runs, run_of)
     arms = stopped(arms_of(kept, runs, run_of), records)
@@ -296,6 +298,15 @@ def clock_of(row: TrialRow) -> str:
     latency = row.options.get("latency_s")
     what = f"{latency:g} s an inference" if isinstance(latency, int | float) else "inferences as measured"
     return f"real time ({what}, {meanwhile})"
+
+
+def _unknown_weights(rows: Sequence[TrialRow]) -> list[str]:
+    """A remark for each policy on a server that does not say which weights it has."""
+    unknown = [r.policy for r in _apart(rows, "policy_settings") if UNKNOWN_WEIGHTS in r.policy_settings]
+    return [
+        f"{policy}: the server's weights are not known, so its trials may be of several checkpoints"
+        for policy in dict.fromkeys(unknown)
+    ]
 
 
 def _clocks(rows: Sequence[TrialRow]) -> list[str]:

@@ -51,6 +51,12 @@ def policy_identity(path: str | Path, revision: str | None = None) -> str:
     return f"{text}@{folder.name[:_LENGTH]}" + (f"+{base}" if base else "")
 
 
+def policy_name(path: str | Path) -> str:
+    """Returns a checkpoint's name in `policy_identity`, without its hash."""
+    local = Path(path).expanduser()
+    return _folder_name(local) if local.is_dir() else str(path)
+
+
 def content_hash(path: Path) -> str:
     """Returns the SHA-256 of a file, or of a checkpoint's folder with all that it is loaded from."""
     return _content_hash(path, frozenset())

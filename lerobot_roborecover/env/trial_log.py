@@ -239,9 +239,9 @@ class TrialLog:
         return self._done.get(key)
 
     def other_rows(self, protocol: Protocol) -> list[str]:
-        """Returns a line for each kind of rows that a run of this protocol does not reuse, although they are
-        of its policy and start."""
-        other = earlier = 0
+        """Returns a line for each kind of rows of this policy and start that a run of the protocol does not
+        reuse, or reuses although nothing says whose they are."""
+        other = earlier = unnamed = 0
         for kind, count in self._kinds.items():
             if (kind.policy, kind.start) != (_nameless(protocol.policy), protocol.start):
                 continue
@@ -249,7 +249,15 @@ class TrialLog:
                 earlier += count
             elif kind.config_hash != replace(protocol, run_seed=kind.run_seed).config_hash():
                 other += count
+            elif protocol.policy == "unknown":
+                unnamed += count
         found = []
+        if unnamed:
+            found.append(
+                f"nothing says which policy this run has: {unnamed} row(s) in {self.path}, of a run that did "
+                "not say it either, are taken for its own. Give each policy a log of its own "
+                "(--env.trial_log)"
+            )
         if other:
             found.append(
                 f"{other} row(s) of this policy under other settings are in {self.path} and are not reused"

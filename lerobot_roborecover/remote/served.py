@@ -53,12 +53,11 @@ class ServedPolicy(PolicyHost):
         """
         return tuple(sorted((key, array.shape, array.dtype.str) for key, array in observation.items()))
 
-    def metadata(self, name: str, identity: str = "") -> dict[str, Any]:
+    def metadata(self, name: str) -> dict[str, Any]:
         """What a client learns when it connects.
 
         Args:
             name: of the policy.
-            identity: of its files and options, so that clients know one policy from another.
         """
         return {
             "server": "roborecover",
@@ -69,7 +68,6 @@ class ServedPolicy(PolicyHost):
             "chunk": self.horizon,
             "observation": {key: list(f.shape) for key, f in self.expected.items()},
             "noise": self.noise(0),
-            **({"identity": identity} if identity else {}),
         }
 
     def check(self, message: Mapping[Any, Any]) -> dict[str, np.ndarray]:

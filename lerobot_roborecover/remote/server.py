@@ -168,7 +168,7 @@ class PolicyServer:
 
     def __init__(self, policy: ServedPolicy, name: str, options: ServeOptions, identity: str = ""):
         self._policy, self._options = policy, options
-        self._metadata = policy.metadata(name, identity)
+        self._metadata = policy.metadata(name) | ({"identity": identity} if identity else {})
         self._connections = 0
         self.served = 0
         """Inferences answered."""

@@ -62,9 +62,9 @@ class PolicySpec:
 
 def default_name(path: str) -> str:
     """A policy's name where none is given: its identity without the hash."""
-    from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.env.identity import policy_name
 
-    return policy_identity(path).split("@")[0].strip("/").replace("/", "--")[:64]
+    return policy_name(path).strip("/").replace("/", "--")[:64]
 
 
 def parse_policies(
