@@ -97,7 +97,9 @@ class ReproductionPlan:
         config = yaml.safe_load(self.checkpoint.config.read_text()) or {}
         arguments = [*self.checkpoint.arguments, *self.arguments]
         apart = {f"--env.{name}" for name in _SET} | {"--policy.path", "--policy.mapping"}
-        given = [a for a in arguments if a.partition("=")[0] not in apart]
+        named = [(a.partition("=")[0], a) for a in arguments]
+        pace = {name for name, _ in named if name.startswith("--runner.")} - {"--runner.portable"}
+        given = [a for name, a in named if name not in apart | pace]
         own = {name: self.option(f"policy.{name}") for name in ("path", "mapping")}
         env = {name: value for name, value in (config.get("env") or {}).items() if name not in _SET}
         return identity_of_run(

@@ -9,10 +9,11 @@ import pytest
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.extent import missing
+from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.hub_results import find_entry, results_yaml
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.make import report
+from lerobot_roborecover.analysis.report_tables import overall
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
@@ -48,14 +49,7 @@ def test_settings_of_one_policy_are_told_apart(tmp_path):
         "act@1a2b [num_inference_steps as saved]",
     )  # fmt: skip
     assert [len(arm.rows) for arm in study.arms] == [24] * 5
-    made = report(str(tmp_path / "log.jsonl"), tmp_path / "report", options=FEW)
-    assert "act@1a2b [num_inference_steps=2]" in [r[0] for r in _table(made)]
-
-
-def _table(made):
-    from lerobot_roborecover.analysis.report_tables import overall
-
-    return overall(made.results).rows
+    assert "act@1a2b [num_inference_steps=2]" in [row[0] for row in overall(analyse(study, FEW)).rows]
 
 
 def test_long_settings_make_short_labels_that_differ(tmp_path):
@@ -166,9 +160,8 @@ WHOLE = {"scenarios": 20, "trials": 2}
 
 
 @pytest.mark.parametrize("extent", [{"good": LACKS, "bad": WHOLE}, {"good": LACKS, "bad": LACKS}])
-def test_there_is_no_verdict_between_incomplete_policies(pair, extent, tmp_path):
-    logs = pair(**extent)
-    study = read_study(logs)
+def test_there_is_no_verdict_between_incomplete_policies(pair, extent):
+    study = read_study(pair(**extent))
     found = compare(study, options=FEW)
     assert found.contrast.verdict is ComparisonVerdict.INCOMPLETE
     shown = to_screen(found)
@@ -176,12 +169,13 @@ def test_there_is_no_verdict_between_incomplete_policies(pair, extent, tmp_path)
     assert "20 of 30 scenarios; shard 1/2 is missing" in " ".join(shown.split())
     asked = compare(study, options=replace(FEW, common=True))
     assert asked.contrast.verdict is ComparisonVerdict.A_BETTER
-    made = report(logs, tmp_path / "report", options=FEW)
-    assert any("good@1: incomplete: 20 of 30 scenarios; shard 1/2 is missing" in r for r in made.remarks)
-    assert {row[5] for row in _table(made) if row[0] == "good@1"} == {"20 of 30"}
-    text = made.files.markdown.read_text()
-    assert "Incomplete: good@1: 20 of 30 scenarios; shard 1/2 is missing." in text
-    assert not any(c.verdict.separated for c in made.results.contrasts)
+    results = analyse(study, FEW)
+    assert any("good@1: incomplete: 20 of 30 scenarios; shard 1/2 is missing" in r for r in results.remarks)
+    table = overall(results)
+    assert {row[5] for row in table.rows if row[0] == "good@1"} == {"20 of 30"}
+    assert "Incomplete: good@1: 20 of 30 scenarios; shard 1/2 is missing." in table.notes
+    assert "Incomplete: good@1 (20 of 30 scenarios; shard 1/2 is missing)" in headline(results)
+    assert not any(c.verdict.separated for c in results.contrasts)
 
 
 def test_complete_policies_have_their_verdict(pair):

@@ -31,7 +31,7 @@ def run(dataset, tmp_path, capfd):
     def call(*extra: str, status: int = 0):
         argv = [
             "eval", "--env", "roborecover_fake", f"--env.scenarios={dataset}", "--eval.n_episodes=1",
-            "--runner.slots=2", f"--output_dir={tmp_path / 'out'}",
+            "--runner.slots=1", f"--output_dir={tmp_path / 'out'}",
             f"--env.trial_log={tmp_path / 'trials.jsonl'}", *extra,
         ]  # fmt: skip
         assert main(argv) == status
@@ -74,7 +74,7 @@ def test_corrected_statistics(run, tmp_path):
     assert again == rows, "the corrected ones are there"
 
 
-def test_another_number_of_inference_steps(run, tmp_path, capsys):
+def test_another_number_of_inference_steps(run, tmp_path, capfd):
     policy = save_policy(tmp_path / "diffusion", "diffusion")
     run(f"--policy.path={policy}", "--policy.num_inference_steps=3")
     rows, printed = run(f"--policy.path={policy}", "--policy.num_inference_steps=4")
@@ -88,7 +88,7 @@ def test_another_number_of_inference_steps(run, tmp_path, capsys):
     for label in ("[num_inference_steps=3]", "[num_inference_steps=4]", "[num_inference_steps as saved]"):
         assert label.strip("[]") in text
     assert main(["merge", str(tmp_path / "trials.jsonl"), "--out", str(tmp_path / "m.jsonl")]) == 2
-    assert "policy setting num_inference_steps is 3" in capsys.readouterr().err
+    assert "policy setting num_inference_steps is 3" in capfd.readouterr().err
 
 
 def test_a_corrected_rename_map(run, tmp_path):
