@@ -39,10 +39,10 @@ def headline(results: Results) -> str:
         sentences.append(
             "Incomplete: "
             + ", ".join(f"{results.recovery.arms[p]} ({lack})" for p, lack in results.lacking.items())
-            + "."
+            + ("." if results.judged else ", so there is no verdict.")
         )
     rivals = [results.ranked.arms[p] for p in results.best_first[1:]]
-    if rivals:
+    if rivals and results.judged:
         sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))
     return " ".join(sentences)
 

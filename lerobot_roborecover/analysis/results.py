@@ -108,7 +108,7 @@ class Results:
         return _lacking(self._direct, self.options)
 
     @property
-    def _judged(self) -> bool:
+    def judged(self) -> bool:
         """Whether the ranked policies are complete, or the user has asked for what they share."""
         return not any(p in self.lacking for p in self.compared.policies)
 
@@ -165,7 +165,7 @@ class Results:
                     self.ranked.arms,
                     self.ranked_draws,
                     unit=self.unit,
-                    complete=self._judged,
+                    complete=self.judged,
                 ),
                 strict=True,
             )
@@ -304,8 +304,9 @@ class Results:
 
     @property
     def matched(self) -> list[int]:
-        """Indices of the ranked policies with trials from both starts on the same scenarios."""
-        return list(self._matched.policies) if self._matched.scenarios else []
+        """Indices of the ranked policies with trials from both starts on the same scenarios; none where the
+        ranked ones are incomplete."""
+        return list(self._matched.policies) if self._matched.scenarios and self.judged else []
 
     @property
     def both_starts(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], Resampling]:
