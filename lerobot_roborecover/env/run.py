@@ -229,7 +229,7 @@ def open_run(
         dataset=scenarios.source,
         dataset_revision=scenarios.revision,
         handoff_check=options.handoff_check,
-        extent=RunExtent(selected, facts.n_episodes, options.shard),
+        extent=RunExtent(selected, facts.n_episodes, "{}/{}".format(*options.shard_of())),
         picture=spec.picture,
         intervention=facts.intervention,
         real_time=real_time,
