@@ -154,6 +154,8 @@ def _loaded_files(folder: Path) -> Iterator[Path]:
         if name.startswith(".") or name in _NEVER_LOADED or path.suffix in _NEVER_LOADED_SUFFIXES:
             continue
         if path.is_dir():
+            if path.is_symlink() and folder.resolve().is_relative_to(path.resolve()):
+                continue  # a link to a folder above
             results = any((path / result).exists() for result in _RESULTS)
             if not results and not (name == ACTIONS_FOLDER and any(folder.glob("*.jsonl"))):
                 yield from _loaded_files(path)

@@ -219,6 +219,7 @@ def test_nothing_else_counts(mine, key, tmp_path):
     (mine / "train_config.json").write_text("{}")
     (mine / ".cache").mkdir()
     (mine / ".cache" / "lock").write_text("x")
+    (mine / "up").symlink_to(mine.parent)
     results = mine / "eval"
     results.mkdir()
     for name in ("trials.jsonl", "eval_info.json", "anything.json"):
