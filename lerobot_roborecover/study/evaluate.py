@@ -16,7 +16,7 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.rounding import has_kernels
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms, report_command
-from lerobot_roborecover.study.child import CANNOT_START, run_module
+from lerobot_roborecover.study.child import CANNOT_START, run_module, stop_running
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import (
     STEPS_BAND,
@@ -91,6 +91,10 @@ def evaluate(
             for number, finished in enumerate(as_completed(running), 1):
                 arm, seconds = running[finished], finished.result()
                 say(f"[{number}/{len(todo)}] {arm.label}: {len(ids) * arm.trials} trials, {seconds:.0f} s")
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            stop_running()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     return todo

@@ -9,7 +9,6 @@ import json
 import os
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -32,6 +31,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, PolicyError
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.trials import check_names as names
 from lerobot_roborecover.trials import check_numbers as numbers
 from lerobot_roborecover.trials.findings import (
@@ -151,13 +151,13 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
 
 def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, Run]:
     """The scenarios and a run whose trial log nobody keeps."""
-    folder = tempfile.TemporaryDirectory(prefix="roborecover-check-")
-    log = f"{folder.name}/trials.jsonl"
+    folder = TemporaryFolder("check")
+    log = f"{folder.path}/trials.jsonl"
     facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes)
     options = copy(cfg.recovery_env)
     options.trial_log = log
     scenarios, run = open_run(options, options.run_spec(), workers=True, facts=facts)
-    run.pool.on_close(folder.cleanup)
+    run.pool.on_close(folder.close)
     return scenarios, run
 
 

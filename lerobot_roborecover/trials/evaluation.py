@@ -8,7 +8,6 @@ loop would change as well, the queue of actions that a policy keeps for itself, 
 from __future__ import annotations
 
 import random
-import tempfile
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -35,6 +34,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.load import HostSpec, load_host, load_processors, policy_config
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
@@ -92,8 +92,8 @@ def evaluate(
     chosen = _scenario_set(scenarios, env)
     options = _env_config(env, chosen.platform)
     module: PreTrainedPolicy | None = policy if isinstance(policy, torch.nn.Module) else None
-    with tempfile.TemporaryDirectory(prefix="roborecover-") as folder, untouched(module):
-        options.trial_log = str(log or Path(folder) / "trials.jsonl")
+    with TemporaryFolder("evaluate") as folder, untouched(module):
+        options.trial_log = str(log or folder / "trials.jsonl")
         config = _policy_config(policy, device)
         called = name or (weights_identity(module) if module is not None else "")
         facts = facts_of(config, policy=called, n_episodes=trials)

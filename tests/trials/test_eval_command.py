@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.trials.progress import ProgressLine
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.loop import outcomes
 from tests.support.processes import PATIENCE_S, alive_after, children
@@ -143,9 +145,63 @@ def test_a_time_limit_stops_cleanly_and_says_how_to_go_on(run, whole, capsys):
     assert outcomes(rows_of(out)) == whole
 
 
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """The temporary folder of this process and its children."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return folder
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_stop_signals_leave_a_log_that_a_rerun_completes(
+    run, whole, monkeypatch, capsys, temporary, number, status
+):
+    """A scheduler's, and a closed terminal's; Ctrl-C's is below."""
+    show, shown = ProgressLine.show, []
+
+    def shows(self, *arguments, **options):
+        show(self, *arguments, **options)
+        shown.append(1)
+        if len(shown) == 3:  # before the first trial, and after two
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(ProgressLine, "show", shows)
+    out = run(status=status)
+    assert len(rows_of(out)) == 2
+    assert "interrupted: 2 of 12 trials done; to go on, run the same command" in capsys.readouterr().err
+    assert (out / "eval_info.json").exists()
+    assert list(temporary.glob("roborecover-*")) == []
+    run()
+    assert outcomes(rows_of(out)) == whole
+
+
+def test_a_full_disk_is_one_line_and_keeps_finished_trials(run, whole, capsys):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, before[1]))
+    try:
+        out = run(status=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    log = out / "trials.jsonl"
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f"roborecover eval: {log}: File too large. ")
+    assert line.endswith("Finished trials are kept")
+    finished = log.read_bytes()
+    assert 0 < finished.count(b"\n") < COUNT * TRIALS
+    assert finished.endswith(b"\n")
+    run()
+    assert log.read_bytes().startswith(finished)
+    assert outcomes(rows_of(out)) == whole
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
-def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(run, whole, arguments, tmp_path, how):
+def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(
+    run, whole, arguments, tmp_path, temporary, how
+):
     out = tmp_path / "out"
     log = out / "trials.jsonl"
     command = [sys.executable, "-m", "lerobot_roborecover.cli.main", "eval", *arguments]
@@ -169,12 +225,15 @@ def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(run, whole, argume
         assert "interrupted" in errors
     assert len(simulators) == 2
     assert not alive_after(simulators)
+    left = list(temporary.glob("roborecover-snapshots-*"))
+    assert len(left) == (how is signal.SIGKILL)
     finished = log.read_bytes()
     finished = finished[: finished.rfind(b"\n") + 1]
     assert 2 <= finished.count(b"\n") < COUNT * TRIALS
     run("--env.step_s=0.02")
     assert log.read_bytes().startswith(finished), "a finished trial was lost or repeated"
     assert outcomes(rows_of(out)) == whole
+    assert list(temporary.glob("roborecover-*")) == []
 
 
 def films(out: Path) -> dict[str, int]:

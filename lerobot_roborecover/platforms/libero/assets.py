@@ -11,12 +11,14 @@ import hashlib
 import importlib.util
 import os
 import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.temporary import TemporaryFolder
+from lerobot_roborecover.whole import write_whole
 
 ASSETS_VARIABLE = "ROBORECOVER_LIBERO_ASSETS"
 """Environment variable that names the asset folder."""
@@ -207,19 +209,19 @@ def _private_config(assets: Path) -> Path:
         }.items()
     )
     name = f"libero-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    base = cache_folder()
+    folder = cache_folder() / name
     try:
-        base.mkdir(parents=True, exist_ok=True)
-        folder = base / name
-        folder.mkdir(exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False, encoding="utf-8") as file:
-            file.write(text)
+        write_whole(folder / "config.yaml", text)
     except OSError:  # no writable home, as in some containers
-        folder = Path(tempfile.mkdtemp(prefix=f"{name}-"))
-        (folder / "config.yaml").write_text(text, encoding="utf-8")
-        return folder
-    os.replace(file.name, folder / "config.yaml")
+        folder = _own_config().path
+        write_whole(folder / "config.yaml", text)
     return folder
+
+
+@cache
+def _own_config() -> TemporaryFolder:
+    """A folder of this process alone, for as long as it lives."""
+    return TemporaryFolder("libero")
 
 
 def _download(folder: Path) -> str:
