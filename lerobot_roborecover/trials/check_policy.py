@@ -29,6 +29,7 @@ from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial import action_problem
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, PolicyError
+from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.temporary import TemporaryFolder
@@ -43,7 +44,6 @@ from lerobot_roborecover.trials.findings import (
     warning,
 )
 from lerobot_roborecover.trials.load import load_host
-from lerobot_roborecover.trials.load_problems import load_remedy
 from lerobot_roborecover.trials.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
 

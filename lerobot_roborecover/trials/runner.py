@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -24,6 +24,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import eval_info
@@ -120,6 +121,11 @@ class RecoveryEvalConfig(EvalPipelineConfig):
     """LeRobot's evaluation config, plus the runner's options. `eval.batch_size` is not used."""
 
     runner: RunnerOptions = field(default_factory=RunnerOptions)
+
+    def __post_init__(self) -> None:
+        if path := parser.get_path_arg("policy"):
+            check_checkpoint(path)
+        super().__post_init__()
 
     @property
     def recovery_env(self) -> RecoveryEnvConfig:
