@@ -17,6 +17,7 @@ from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.load_problems import plain_loading
+from lerobot_roborecover.policies.threads import fit_threads
 from lerobot_roborecover.remote.keys import API_KEY, api_key
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.server import PolicyServer, ServeOptions, is_loopback
@@ -109,6 +110,7 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
         raise OptionError("--policy.path: an adapter; merge it into its base policy first")
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
+    fit_threads(config.device)
     path = str(config.pretrained_path)
     with plain_loading(f"--policy.path={path}"):
         policy = get_policy_class(config.type).from_pretrained(

@@ -25,12 +25,15 @@ from lerobot_roborecover.study.outcomes import (
     outcomes_of,
     read_outcomes,
 )
-from lerobot_roborecover.trials.sizes import usable_cores
+from lerobot_roborecover.trials.sizes import SLOT_GB
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
 DONE_FILE = "done.json"
 """Beside the log of an arm that has finished: the run that it was."""
 RUN_FILE = "run.yaml"
 """Beside the log of every arm: its run, as `roborecover eval --config_path` reads it."""
+ARM_GB = 1.0
+"""Memory reckoned for an arm beside its simulator: LeRobot, torch and a small policy."""
 _SHOWN_LINES = 12
 
 
@@ -61,7 +64,8 @@ def evaluate(
         out: folder of the results; a rerun goes on there.
         every: take every n-th scenario.
         slots: simulators at once in each arm; 0: as many as there are cores for it.
-        jobs: arms at once; 0: one per core. A small policy keeps one core busy, and no second.
+        jobs: arms at once; 0: one per core, as far as memory allows. A small policy keeps one core busy, and
+            no second.
         say: takes progress lines.
 
     Returns:
@@ -73,7 +77,7 @@ def evaluate(
     """
     ids = scenario_ids(study, every)
     cores = usable_cores()
-    jobs = jobs or cores
+    jobs = jobs or max(1, min(cores, int(min(available_gb(), 1e6) / (ARM_GB + SLOT_GB))))
     todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
 
     check_arms([arm for arm in todo if not _finished(arm, ids)], study, out)

@@ -6,7 +6,6 @@ pictures is looked for; what only a score can tell is not.
 """
 
 import json
-import os
 import statistics
 import sys
 import time
@@ -45,6 +44,8 @@ from lerobot_roborecover.trials.findings import (
 )
 from lerobot_roborecover.trials.load import load_host
 from lerobot_roborecover.trials.runner import RecoveryEvalConfig, host_spec
+from lerobot_roborecover.trials.sizes import default_slots
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
 
 SHORT = {"--json": "--check.json=true"}
@@ -339,7 +340,8 @@ def _estimate(
     cfg: CheckPolicyConfig, host: Host, scenarios: ScenarioSet, scenario: Scenario, steps: FirstSteps
 ) -> list[Finding]:
     """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
-    slots = min(cfg.runner.slots or os.cpu_count() or 1, len(scenarios) * cfg.eval.n_episodes)
+    room = default_slots(str(cfg.given_policy.device), usable_cores(), available_gb())
+    slots = min(cfg.runner.slots or room, len(scenarios) * cfg.eval.n_episodes)
     batch = min(slots, host.max_batch) if host.batched else 1
     alone = statistics.median(steps.infer_s[1:] or steps.infer_s)
     together = alone

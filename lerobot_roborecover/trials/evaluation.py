@@ -136,6 +136,7 @@ def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
     modes = [] if policy is None else [(module, module.training) for module in policy.modules()]
     gpus = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
     python, numpy = random.getstate(), np.random.get_state()
+    threads = torch.get_num_threads()
     benchmark, tf32 = torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32
     try:
         with torch.random.fork_rng(devices=gpus):
@@ -146,6 +147,7 @@ def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
         random.setstate(python)
         np.random.set_state(numpy)
         torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32 = benchmark, tf32
+        torch.set_num_threads(threads)
 
 
 def _scenario_set(scenarios: Any, env: Any) -> ScenarioSet:

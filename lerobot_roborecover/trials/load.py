@@ -21,6 +21,7 @@ from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
 from lerobot_roborecover.policies.policy_host import PolicyHost
+from lerobot_roborecover.policies.threads import fit_threads
 from lerobot_roborecover.trials.portable import make_portable
 
 
@@ -92,6 +93,7 @@ def _load_host(spec: HostSpec) -> Host:
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(spec.seed)
+    fit_threads(spec.policy.device)
     rename_map = dict(spec.rename_map)
     policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
     policy.eval()
