@@ -24,6 +24,8 @@ ASSETS_VARIABLE = "ROBORECOVER_LIBERO_ASSETS"
 """Environment variable that names the asset folder."""
 HUB_REPOSITORY = "lerobot/libero-assets"
 """Where hf-libero downloads its assets from (libero/libero/utils/download_utils.py)."""
+HUB_REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
+"""The commit that is downloaded: its address is a hash of all of its files."""
 
 _MODELS = {
     "articulated_objects/{}.xml": "flat_stove microwave white_cabinet wooden_cabinet",
@@ -100,7 +102,7 @@ def find_assets(option: str | None = None, *, download: bool = True) -> Path:
     raise SimulatorError(
         f"LIBERO's assets are not on this machine: looked at {'; '.join(tried)}; {failure}. Set "
         f"--env.assets_dir or ${ASSETS_VARIABLE} to a folder that holds them, or download them with: "
-        f"hf download {HUB_REPOSITORY} --repo-type dataset --local-dir {cache}"
+        f"hf download {HUB_REPOSITORY} --repo-type dataset --revision {HUB_REVISION} --local-dir {cache}"
     )
 
 
@@ -230,7 +232,7 @@ def _download(folder: Path) -> str:
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        snapshot_download(repo_id=HUB_REPOSITORY, repo_type="dataset", local_dir=folder)
+        snapshot_download(HUB_REPOSITORY, repo_type="dataset", revision=HUB_REVISION, local_dir=folder)
     except (OSError, ValueError, HfHubHTTPError) as err:
         return (
             f"downloading {HUB_REPOSITORY} failed ({' '.join(str(err).split())[:200] or type(err).__name__})"
