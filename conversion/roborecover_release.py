@@ -20,6 +20,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
@@ -316,4 +317,4 @@ def _progress(what: str, done: int, total: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("roborecover_release", main))

@@ -7,13 +7,10 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from types import ModuleType
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.cli.output import CLOSED_PIPE, accept_all_text, flush_output, output_is_closed
-from lerobot_roborecover.errors import RoboRecoverError, os_error_line
-from lerobot_roborecover.signals import status_of, stop_signals_raise
+from lerobot_roborecover.cli.guard import guarded
 
 COMMANDS = (
     "doctor",
@@ -85,29 +82,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; by default the process's own.
 
     Returns:
-        Exit status: 0 done; 1 done but something is wrong; 2 refused; 130, 143 or 129 interrupted by Ctrl-C,
-        SIGTERM or SIGHUP; 141 standard output was closed, as by `| head`.
+        Exit status: 0 done; 1 done but something is wrong; 2 refused; others as `guarded`.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     command = argv[0] if argv else ""
     quiet(command)
-    accept_all_text()
-    try:
-        with stop_signals_raise():
-            status = _run(command, argv)
-    except SystemExit:  # of argparse
-        flush_output(command)
-        raise
-    except KeyboardInterrupt as err:
-        status = _refused(command, "interrupted", status_of(err))
-    except BrokenPipeError as err:
-        # Another process may have gone as well, such as a server.
-        status = CLOSED_PIPE if output_is_closed() else _refused(command, os_error_line(err))
-    except RoboRecoverError as err:
-        status = _refused(command, str(err))
-    except OSError as err:
-        status = _refused(command, os_error_line(err))
-    return flush_output(command) or status
+    return guarded(f"roborecover {command}", lambda: _run(command, argv))
 
 
 def _run(command: str, argv: list[str]) -> int:
@@ -116,12 +96,6 @@ def _run(command: str, argv: list[str]) -> int:
         return module.pass_through(argv[1:])
     args = build_parser().parse_args(argv)
     return args.run(args)
-
-
-def _refused(command: str, why: str, status: int = 2) -> int:
-    with suppress(OSError):  # standard error may be closed, too
-        print(f"roborecover {command}: {why}", file=sys.stderr)
-    return status
 
 
 def quiet(command: str) -> None:

@@ -27,17 +27,17 @@ def output_is_closed() -> bool:
     return any(map(_is_closed, (sys.stdout, sys.stderr)))
 
 
-def flush_output(command: str) -> int:
+def flush_output(name: str) -> int:
     """Writes what is still buffered, so that the interpreter need not at its end, where errors are noisy.
 
     Args:
-        command: for messages.
+        name: of the command, for messages.
 
     Returns:
         0, or the exit status where the text could not be written.
     """
     status = 0
-    for name, stream in (("standard output", sys.stdout), ("standard error", sys.stderr)):
+    for where, stream in (("standard output", sys.stdout), ("standard error", sys.stderr)):
         if stream is None:
             continue
         try:
@@ -46,10 +46,10 @@ def flush_output(command: str) -> int:
             status = CLOSED_PIPE
         except OSError as err:
             status = 2
-            err.filename = name
+            err.filename = where
             _discard(stream)
             with suppress(OSError):
-                print(f"roborecover {command}: {os_error_line(err)}", file=sys.stderr)
+                print(f"{name}: {os_error_line(err)}", file=sys.stderr)
         if _is_closed(stream):
             _discard(stream)
     return status

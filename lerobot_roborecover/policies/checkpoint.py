@@ -154,7 +154,8 @@ def _hub_config(name: str, label: str, revision: str | None) -> Path:
     try:
         return Path(hf_hub_download(name, CONFIG_FILE, revision=revision))
     except HFValidationError:
-        problem = "there is no such folder. Check the spelling; ~ is not read after an equals sign"
+        home = "; your shell replaces ~ only at the start of a word" if name.startswith("~") else ""
+        problem = f"there is no such folder. Check the spelling{home}"
     except LocalEntryNotFoundError:
         problem = (
             "there is no such folder, and the Hub cannot be reached or HF_HUB_OFFLINE is set. Check the "

@@ -37,7 +37,7 @@ def load_remedy(err: Exception) -> str:
         return "install what it names: pip install 'lerobot_env_roborecover[policies]' has LeRobot's families"
     if kind & {"OutOfMemoryError", "MemoryError"}:
         return "free memory there, or take another --policy.device"
-    if isinstance(err, OSError) and err.errno is not None:
+    if isinstance(err, FileNotFoundError) and err.errno is not None:
         return "the checkpoint is not whole: copy or download it again"
     return ""
 

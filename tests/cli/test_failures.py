@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,7 @@ from lerobot_roborecover.journal import AppendOnly
 from lerobot_roborecover.whole import new_folder, write_whole
 from tests.support.trial_rows import policy_rows, write_log
 
+CONVERSION = Path(__file__).parents[2] / "conversion"
 START = [sys.executable, "-m", "lerobot_roborecover.cli.main"]
 
 
@@ -233,3 +235,8 @@ def test_under_nohup_a_closed_terminal_stops_nothing(stands_in):
         assert main(["doctor"]) == 0
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("script", sorted(CONVERSION.glob("*.py")), ids=lambda path: path.stem)
+def test_conversion_scripts_are_guarded_as_commands_are(script):
+    assert f'sys.exit(guarded("{script.stem}", main))' in script.read_text()

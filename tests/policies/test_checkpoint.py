@@ -103,7 +103,7 @@ def test_which_folder_to_name_instead(tmp_path):
     ("name", "words"),
     [
         ("/nowhere/at/all", "no LeRobot policy there: there is no such folder"),
-        ("~/policy", "~ is not read after an equals sign"),
+        ("~/policy", "your shell replaces ~ only at the start of a word"),
         ("nobody/such-a-policy", "the Hub cannot be reached or HF_HUB_OFFLINE is set"),
     ],
 )
