@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.licenses import license_argument
@@ -149,4 +150,4 @@ def find_task(args: argparse.Namespace, instruction: str) -> Task:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("lerobot_rollouts", main))

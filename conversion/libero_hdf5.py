@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets.converted import write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
 from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array
@@ -132,4 +133,4 @@ def frames(obs: Any, steps: int) -> Iterator[Frame]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("libero_hdf5", main))

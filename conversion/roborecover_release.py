@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
@@ -41,6 +41,7 @@ from lerobot_roborecover.platforms.robotwin.checkout import RobotwinCheckout
 from lerobot_roborecover.platforms.robotwin.render import QUALITIES
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.whole import check_new, write_whole
+from lerobot_roborecover.workers.capacity import usable_cores
 from lerobot_roborecover.workers.jobs import JobPool
 
 _OWN_OPTIONS = {
@@ -81,7 +82,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     add("--render", action="store_true", help="--last-frames, and the prefixes' observations as episodes")
     add("--size", type=int, default=256, help="LIBERO's picture side in pixels (%(default)s, as released)")
-    add("--workers", type=int, default=os.cpu_count() or 1, help="processes that replay (%(default)s)")
+    add("--workers", type=int, default=usable_cores(), help="processes that replay (%(default)s)")
     add("--assets-dir", help="LIBERO's assets, where they are not found by themselves")
     add("--robotwin-root", help="RoboTwin checkout whose code replays (default: $ROBOTWIN_ROOT)")
     add("--render-quality", default="rt", choices=QUALITIES, help="of RoboTwin's pictures (%(default)s)")
@@ -316,4 +317,4 @@ def _progress(what: str, done: int, total: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("roborecover_release", main))

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets.converted import write_converted
 from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array
 from lerobot_roborecover.datasets.licenses import license_argument
@@ -138,4 +139,4 @@ def decode(jpeg: bytes) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("robotwin_hdf5", main))

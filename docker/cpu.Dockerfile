@@ -11,11 +11,12 @@ ENV DEBIAN_FRONTEND=noninteractive \
     MUJOCO_GL=egl \
     PATH=/lerobot/.venv/bin:$PATH
 
+COPY scripts/uv_requirements.txt /tmp/
 RUN apt-get update \
     && apt-get install -y --no-install-recommends \
         ffmpeg git libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 \
     && rm -rf /var/lib/apt/lists/* \
-    && pip install --no-cache-dir uv==0.13.9 \
+    && pip install --no-cache-dir --only-binary :all: --require-hashes -r /tmp/uv_requirements.txt \
     && useradd --uid 1000 --create-home --shell /bin/bash user_lerobot \
     && mkdir /lerobot \
     && chown user_lerobot:user_lerobot /lerobot

@@ -17,11 +17,12 @@ ENV DEBIAN_FRONTEND=noninteractive \
     PATH=/lerobot/.venv/bin:$PATH
 
 # What builds egl_probe, which LIBERO asks for and which has no wheels; OpenGL; FFmpeg for torchcodec.
+COPY scripts/uv_requirements.txt /tmp/
 RUN apt-get update \
     && apt-get install -y --no-install-recommends \
         cmake ffmpeg g++ git libegl1 libgl1 libglvnd0 make \
     && rm -rf /var/lib/apt/lists/* \
-    && pip install --no-cache-dir uv==0.13.9 \
+    && pip install --no-cache-dir --only-binary :all: --require-hashes -r /tmp/uv_requirements.txt \
     && useradd --uid 1000 --create-home --shell /bin/bash user_lerobot \
     && mkdir /lerobot \
     && chown user_lerobot:user_lerobot /lerobot
@@ -38,8 +39,8 @@ RUN uv venv --python 3.12 \
     && uv pip install --no-cache --compile-bytecode -c constraints.txt -e ".[libero,policies,remote]" \
     && mkdir -p outputs
 
-# A tag or commit of the dataset makes the image repeatable.
-ARG LIBERO_ASSETS_REVISION=main
+# The commit that the package downloads (lerobot_roborecover/platforms/libero/assets.py).
+ARG LIBERO_ASSETS_REVISION=0b3ea86be5fe169d0fd036ae63d1070ec09e90f6
 RUN hf download lerobot/libero-assets --repo-type dataset --revision "$LIBERO_ASSETS_REVISION" \
         --local-dir "$ROBORECOVER_LIBERO_ASSETS" \
     && rm -rf "$ROBORECOVER_LIBERO_ASSETS/.cache"

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
+from lerobot_roborecover.errors import naming
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_JOURNAL_BYTES = 2**28
@@ -101,10 +102,11 @@ class AppendOnly:
         size = os.fstat(number).st_size
         try:
             # Without a buffer: after a full disk, nothing of it may come later.
-            written = 0
-            while written < len(data):
-                written += os.write(number, data[written:])
-            os.fsync(number)
+            with naming(self.path):
+                written = 0
+                while written < len(data):
+                    written += os.write(number, data[written:])
+                os.fsync(number)
         except OSError:
             os.ftruncate(number, size)
             raise

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -13,6 +16,7 @@ from lerobot_roborecover.interventions.detectors import register_detectors
 from lerobot_roborecover.interventions.monitor import register_monitors
 from lerobot_roborecover.platforms.base import ENV_PREFIX
 from lerobot_roborecover.remote import configuration_remote  # noqa: F401 - registers the policy
+from lerobot_roborecover.signals import Terminated, handle, raise_terminated
 
 register_monitors()
 register_detectors()
@@ -52,10 +56,21 @@ def plain_errors(kind: type[BaseException], error: BaseException, trace: Traceba
     """`sys.excepthook` that shows a refusal of ours as its message alone: the traceback would bury it."""
     if issubclass(kind, RoboRecoverError):
         print(f"error: {error}", file=sys.stderr)
+    elif issubclass(kind, Terminated):
+        print(f"error: ended by {error}; finished trials are kept", file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)
+
+
+def is_ours(argv: Sequence[str]) -> bool:
+    """Returns whether a command line evaluates in one of our environments."""
+    return Path(argv[0]).name == "lerobot-eval" and any(
+        word.startswith(f"--env.type={ENV_PREFIX}") for word in argv
+    )
 
 
 if sys.argv and Path(sys.argv[0]).name.startswith("lerobot-"):
     sys.argv[:] = rewrite_env_argument(sys.argv)
     sys.excepthook = plain_errors
+    if is_ours(sys.argv) and threading.current_thread() is threading.main_thread():
+        handle((signal.SIGTERM, signal.SIGHUP), raise_terminated)

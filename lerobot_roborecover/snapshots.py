@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 from collections import OrderedDict
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from lerobot_roborecover.scenario import Rollout
+from lerobot_roborecover.whole import write_whole
 
 
 class SnapshotCache:
@@ -55,11 +55,10 @@ class SnapshotCache:
         """Keeps a snapshot together with the state hash it leads to."""
         self._remember(key, (snapshot, state_sha256))
         if self._folder is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
             body = state_sha256.encode() + snapshot
-            with tempfile.NamedTemporaryFile(dir=self._folder, delete=False) as file:
-                file.write(hashlib.sha256(body).digest() + body)
-            os.replace(file.name, self._folder / f"{key}.snapshot")
+            # A full disk costs a replay later; it is not to cost the trial.
+            with suppress(OSError):
+                write_whole(self._folder / f"{key}.snapshot", hashlib.sha256(body).digest() + body)
 
     def reject(self, key: str) -> None:
         """Drops a snapshot that did not lead to the replayed state, for good."""

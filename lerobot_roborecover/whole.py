@@ -17,6 +17,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lerobot_roborecover.errors import naming
 from lerobot_roborecover.scenario import ScenarioError
 
 
@@ -27,9 +28,10 @@ def new_file(path: Path) -> Generator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     _forget_files(path)
     try:
-        yield temporary
-        _to_disk(temporary)
-        os.replace(temporary, path)
+        with naming(path):
+            yield temporary
+            _to_disk(temporary)
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -83,7 +85,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 
 
 def _at(root: Path, temporary: Path, old: Path, replace: bool) -> Iterator[Path]:
-    yield temporary
+    with naming(root):
+        yield temporary
     if root.exists() and not replace:
         root.rmdir()
     elif root.exists():

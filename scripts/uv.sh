@@ -18,6 +18,7 @@ if [[ ! -x .tools/bin/uv ]]; then
     rm -rf .tools/bin .tools/lib .tools/lib64 .tools/include .tools/pyvenv.cfg
     "$python" -m venv .tools
     echo '*' >.tools/.gitignore
-    .tools/bin/python -m pip install --quiet --retries 5 uv || .tools/bin/python -m pip install --quiet uv
+    # Held to the hashes that PyPI published. Wheels only: a source distribution would run code to be built.
+    .tools/bin/python -m pip install --quiet --retries 5 --only-binary :all: --require-hashes -r scripts/uv_requirements.txt
 fi
 echo "$PWD/.tools/bin/uv"

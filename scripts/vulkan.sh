@@ -5,7 +5,7 @@
 #
 # SAPIEN needs Mesa 25 or later. Where the system's is older (Debian 12: 22.3, which fails), the driver of
 # bookworm-backports is unpacked in .tools/mesa and nothing is installed: a newer Mesa in the system would also change
-# the OpenGL that MuJoCo draws with. Needs no root. The libraries it is linked with come with Debian's own
+# the OpenGL that MuJoCo draws with. apt checks the archive's signature and each package's hash. Needs no root. The libraries it is linked with come with Debian's own
 # mesa-vulkan-drivers. Safe to run again.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

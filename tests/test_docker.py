@@ -14,6 +14,8 @@ import pytest
 
 from lerobot_roborecover.cli.main import COMMANDS, main
 from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.platforms.libero.assets import HUB_REVISION
+from lerobot_roborecover.platforms.robotwin.checkout import ASSETS_REVISION
 from tests.support.factories import fake_dataset, save_policy
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +35,41 @@ def test_an_image_installs_what_there_is(image):
     assert command[1] in COMMANDS
     ignored = image.with_name(f"{image.name}.dockerignore").read_text().split()
     assert {".git", ".venv", ".venv-main", "outputs"} <= set(ignored)
+
+
+@pytest.mark.parametrize("image", IMAGES, ids=lambda p: p.stem)
+def test_an_image_is_not_roots_and_takes_nothing_unpinned(image):
+    text = image.read_text()
+    after = text[text.index("USER 1000") :]
+    assert "USER root" not in after
+    assert "uv venv" in after, "packages are the user's"
+    assert "--require-hashes -r /tmp/uv_requirements.txt" in text
+    assert "pip install --no-cache-dir uv" not in text
+    revisions = dict(re.findall(r"^ARG (\w+_(?:REVISION|COMMIT))=(\S+)$", text, re.M))
+    assert all(re.fullmatch("[0-9a-f]{40}", value) for value in revisions.values())
+    for download in re.findall(r"^RUN hf download (?:.*\\\n)*.*", text, re.M):
+        assert re.search(r'--revision "\$(\w+)"', download)[1] in revisions
+    if "objects.zip" in text:
+        assert re.search(r"_SHA256=[0-9a-f]{64}$", text, re.M)
+        assert text.index("sha256sum --check --strict") < text.index("unzip -q")
+
+
+def test_the_libero_image_has_the_assets_that_the_package_downloads():
+    assert f"ARG LIBERO_ASSETS_REVISION={HUB_REVISION}" in (ROOT / "docker" / "libero.Dockerfile").read_text()
+    assert (
+        f"ARG ROBOTWIN_ASSETS_REVISION={ASSETS_REVISION}"
+        in (ROOT / "docker" / "robotwin.Dockerfile").read_text()
+    )
+    assert f"--revision {ASSETS_REVISION}" in (ROOT / "docs" / "robotwin.md").read_text()
+
+
+def test_uv_is_held_to_hashes():
+    lines = (ROOT / "scripts" / "uv_requirements.txt").read_text().replace("\\\n", "").splitlines()
+    (uv,) = (line for line in lines if not line.startswith("#"))
+    assert re.fullmatch(r"uv==[\d.]+( +--hash=sha256:[0-9a-f]{64})+ *", uv)
+    script = (ROOT / "scripts" / "uv.sh").read_text()
+    assert "--require-hashes -r scripts/uv_requirements.txt" in script
+    assert len(re.findall("pip install", script)) == 1
 
 
 def test_images_have_one_base():

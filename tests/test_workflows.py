@@ -80,3 +80,17 @@ def test_linters_of_workflows_find_nothing(tool):
     arguments = ["--offline", "--persona", "auditor", ".github"] if tool == "zizmor" else []
     done = subprocess.run([tool, *arguments], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_dependabot_looks_after_python_but_for_what_decides_scores():
+    updates = yaml.safe_load((ROOT / ".github" / "dependabot.yml").read_text())["updates"]
+    (python,) = (u for u in updates if u["package-ecosystem"] == "pip")
+    assert python["directories"] == ["/", "/scripts"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = [*project["dependencies"], *(r for e in ("libero", "robotwin", "gym") for r in EXTRAS[e])]
+    decisive = {re.split(r"[\[=]", r)[0] for r in pinned if "==" in r}
+    assert {entry["dependency-name"] for entry in python["ignore"]} == decisive
+    by_hand = [f"version-update:semver-{part}" for part in ("major", "minor", "patch")]
+    assert all(entry["update-types"] == by_hand for entry in python["ignore"]), (
+        "security updates are proposed"
+    )

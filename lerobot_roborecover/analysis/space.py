@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from lerobot_roborecover.datasets.load import HUB_ID
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.whole import new_file, write_whole
 
 
 @dataclass(frozen=True)
@@ -125,9 +124,8 @@ def _media(folders: Sequence[tuple[str, Path]], panel: Panel, out: Path) -> dict
         for scenario_id, path in find_media(folder, ids).items():
             target = f"media/{number}-{name}/{scenario_id}{path.suffix}"
             (out / target).parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=out) as fresh:
-                copy = shutil.copyfile(path, Path(fresh) / "copy")
-                Path(copy).replace(out / target)
+            with new_file(out / target) as fresh:
+                shutil.copyfile(path, fresh)
             clips.setdefault(scenario_id, []).append(TrialVideo(policy, target))
     return clips
 

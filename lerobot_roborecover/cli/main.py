@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from lerobot_roborecover import __version__
-from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.cli.guard import guarded
 
 COMMANDS = (
     "doctor",
@@ -82,23 +82,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; by default the process's own.
 
     Returns:
-        Exit status: 0 done, 1 done but something is wrong, 2 refused, 130 interrupted.
+        Exit status: 0 done; 1 done but something is wrong; 2 refused; others as `guarded`.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     command = argv[0] if argv else ""
     quiet(command)
+    return guarded(f"roborecover {command}", lambda: _run(command, argv))
+
+
+def _run(command: str, argv: list[str]) -> int:
     module = _module(command) if command in COMMANDS else None
-    try:
-        if module is not None and hasattr(module, "pass_through"):
-            return module.pass_through(argv[1:])
-        args = build_parser().parse_args(argv)
-        return args.run(args)
-    except KeyboardInterrupt:
-        print(f"roborecover {command}: interrupted", file=sys.stderr)
-        return 130
-    except RoboRecoverError as err:
-        print(f"roborecover {command}: {err}", file=sys.stderr)
-        return 2
+    if module is not None and hasattr(module, "pass_through"):
+        return module.pass_through(argv[1:])
+    args = build_parser().parse_args(argv)
+    return args.run(args)
 
 
 def quiet(command: str) -> None:

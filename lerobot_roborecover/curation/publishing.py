@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.curation.people import anonymise, find_people
+from lerobot_roborecover.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,8 +50,8 @@ def publish_dataset(request: PublishRequest, say: Callable[[str], None], note: C
         return
     root = request.dataset.resolve()
     # Beside the dataset, on the same disk, so that its videos are linked and not copied.
-    with tempfile.TemporaryDirectory(prefix=".anonymised-", dir=root.parent) as folder:
-        copy = Path(folder) / root.name
+    with TemporaryFolder("copy", root.parent, ".anonymised-") as folder:
+        copy = folder / root.name
         left = anonymise(root, copy, people)
         notes += [f"people    a name is still in {name}: look at it before you publish" for name in left]
         _publish(request, copy, f"{request.dataset}, anonymised", notes, say, note)
@@ -96,8 +96,8 @@ def _rendered(root: Path, note: Callable[[str], None]) -> dict[str, np.ndarray]:
 
     scenarios = read_scenarios(root)
     shown = [scenarios[row] for row in spread(scenarios, GRID_TILES)]
-    with tempfile.TemporaryDirectory() as folder:
-        files, problem = render_frames(shown, Path(folder))
+    with TemporaryFolder("frames") as folder:
+        files, problem = render_frames(shown, folder)
         if problem:
             note(f"some recovery frames could not be rendered: {problem}")
         return {name: np.asarray(Image.open(path).convert("RGB")) for name, path in files.items()}

@@ -14,10 +14,9 @@ from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
 from lerobot_roborecover.rounding import policy_kernels
 from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
-from lerobot_roborecover.workers.parent import ends_with_this
+from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 _POLL_S = 0.5
-_STOP_S = 10.0
 _SHOWN_LINES = 12
 
 
@@ -97,7 +96,7 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
                 time.sleep(_POLL_S)
                 tally.add(tail.read())
         finally:
-            _stop(process)
+            stop_children([process])
     tally.add(tail.read())
     progress.show(tally, final=True)
     if process.returncode != 0 or tally.done < tally.total:
@@ -108,15 +107,3 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
             f"{tally.total} trials. The end of {output}:\n{shown}\n"
             "Run the same command again to go on with what is left; 'roborecover doctor' checks this machine"
         )
-
-
-def _stop(process: subprocess.Popen) -> None:
-    """Ends a child that is still running, so that an interrupted demo leaves nothing behind."""
-    if process.poll() is not None:
-        return
-    process.terminate()
-    try:
-        process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

@@ -12,6 +12,7 @@ from typing import Any
 
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.probe import run_probe
+from lerobot_roborecover.workers.capacity import usable_cores
 
 _RENDER_TIMEOUT_S = 60.0
 _LOW_DISK_GB = 5.0
@@ -85,9 +86,10 @@ def _driver() -> str:
 
 def check_cores() -> Check:
     """Processor cores this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores, there = usable_cores(), os.cpu_count() or 1
     if cores > 1:
-        return Check("Cores", Status.OK, str(cores))
+        of = f" of {there}: the others are not for this process (affinity, or a container's quota)"
+        return Check("Cores", Status.OK, f"{cores}{of if cores < there else ''}")
     return Check("Cores", Status.WARNING, "1", "simulators run one per core: use --eval.batch_size=1")
 
 

@@ -6,7 +6,10 @@ import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 
+from draccus.utils import DecodingError, ParsingError
 from lerobot.configs import parser
+
+from lerobot_roborecover.errors import OptionError, RoboRecoverError
 
 
 def run_with_arguments[C](command: Callable[[C], int], program: str, argv: Sequence[str]) -> int:
@@ -22,8 +25,35 @@ def run_with_arguments[C](command: Callable[[C], int], program: str, argv: Seque
     """
     # LeRobot types the wrapped command as the bare one, which cannot be called without a configuration.
     wrapped: Callable[..., int] = parser.wrap()(command)
-    with process_arguments(program, argv):
+    with process_arguments(program, argv), plain_parsing():
         return wrapped()
+
+
+@contextmanager
+def plain_parsing(label: str = "", *others: type[Exception]) -> Generator[None]:
+    """Raises what a configuration refuses as one line, which draccus hides behind errors of its own.
+
+    Args:
+        label: what the message begins with.
+        others: exceptions that count as refusals, too.
+
+    Raises:
+        RoboRecoverError: as the configuration raised it.
+        OptionError: in the words of what LeRobot or draccus raised.
+    """
+    try:
+        yield
+    except (ParsingError, DecodingError, *others) as err:
+        causes: list[BaseException] = [err]
+        while causes[-1].__cause__ is not None:
+            causes.append(causes[-1].__cause__)
+        for cause in causes:
+            if isinstance(cause, RoboRecoverError):
+                raise cause from None
+        # A plain ParsingError says "Couldn't instantiate class ..." and nothing of the reason.
+        reason = next((cause for cause in causes if type(cause) is not ParsingError), err)
+        words = " ".join(str(reason).split())
+        raise OptionError(f"{label}: {words:.500}" if label else f"{words:.500}") from err
 
 
 @contextmanager

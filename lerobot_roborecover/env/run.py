@@ -5,7 +5,6 @@ before a simulator starts.
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,6 +33,7 @@ from lerobot_roborecover.platforms.robot_fingerprint import (
 )
 from lerobot_roborecover.platforms.versions import installed, required, version_problems
 from lerobot_roborecover.scenario import Scenario, Start, TrialStart
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.workers.messages import SlotConfig
 from lerobot_roborecover.workers.slots import SlotPool
 
@@ -216,11 +216,11 @@ def open_run(
         logger.warning("dropped a last line of %d bytes that a crash had cut off", log.dropped_bytes)
     folder, shared = options.snapshot_dir, None
     if not folder:
-        shared = tempfile.TemporaryDirectory(prefix="roborecover-snapshots-")
-        folder = shared.name
+        shared = TemporaryFolder("snapshots")
+        folder = str(shared.path)
     pool = SlotPool(replace(spec.slot, snapshot_dir=folder), workers=workers, timeout_s=options.watchdog_s)
     if shared is not None:
-        pool.on_close(shared.cleanup)
+        pool.on_close(shared.close)
     pool.on_close(log.close)
     run = Run(
         pool=pool,

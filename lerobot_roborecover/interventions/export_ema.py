@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.policies.checkpoint import check_folder
 from lerobot_roborecover.whole import check_new, new_folder
 
 _TRAINING_STATE = Path("training_state") / "optimizer_state.safetensors"
@@ -74,6 +75,7 @@ def _load(model: Path) -> Any:
     from lerobot.policies import get_policy_class
     from lerobot.utils.import_utils import register_third_party_plugins
 
+    check_folder(model, str(model))
     register_third_party_plugins()
     config = PreTrainedConfig.from_pretrained(model)
     if config.use_peft:

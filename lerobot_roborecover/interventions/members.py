@@ -18,6 +18,8 @@ from lerobot.utils.constants import ACTION
 from lerobot_roborecover.env.intervention_options import POLICY_TYPE
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.interventions.configuration_intervention import MemberConfig
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.policy_host import PolicyHost
 
 
@@ -78,6 +80,7 @@ def load_member(
         OptionError: there is no such checkpoint, or it is of another observation or action space.
     """
     option = f"--policy.{role}.path={member.path}"
+    check_checkpoint(member.path, option, member.revision)
     try:
         config = PreTrainedConfig.from_pretrained(member.path, revision=member.revision)
     except (FileNotFoundError, ValueError, OSError) as err:
@@ -101,17 +104,18 @@ def load_member(
             )
         vars(config)["n_action_steps"] = member.n_action_steps  # of those that act in chunks, not of the base
     _check(role, member, config, features, action)
-    policy = make_policy(config, env_cfg=_own_features(config))
-    policy.eval()
-    pre, post = make_pre_post_processors(
-        policy_cfg=config,
-        pretrained_path=member.path,
-        pretrained_revision=member.revision,
-        preprocessor_overrides={
-            "device_processor": {"device": str(policy.config.device)},
-            "rename_observations_processor": {"rename_map": member.rename_map},
-        },
-    )
+    with plain_loading(option):
+        policy = make_policy(config, env_cfg=_own_features(config))
+        policy.eval()
+        pre, post = make_pre_post_processors(
+            policy_cfg=config,
+            pretrained_path=member.path,
+            pretrained_revision=member.revision,
+            preprocessor_overrides={
+                "device_processor": {"device": str(policy.config.device)},
+                "rename_observations_processor": {"rename_map": member.rename_map},
+            },
+        )
     return MemberHost(policy, pre, post)
 
 

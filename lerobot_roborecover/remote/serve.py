@@ -16,7 +16,13 @@ from lerobot.utils.utils import init_logging
 from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
+<<<<<<< HEAD
 from lerobot_roborecover.env.policy_settings import digest_of
+=======
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.policies.load_problems import plain_loading
+from lerobot_roborecover.policies.threads import fit_threads
+>>>>>>> wt-err
 from lerobot_roborecover.remote.keys import API_KEY, api_key
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.server import PolicyServer, ServeOptions, is_loopback
@@ -52,6 +58,7 @@ class ServeConfig:
     def __post_init__(self):
         path = parser.get_path_arg("policy")
         if path:
+            check_checkpoint(path)
             overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
             self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
             self.policy.pretrained_path = Path(path)
@@ -108,22 +115,29 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
         raise OptionError("--policy.path: an adapter; merge it into its base policy first")
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
+    fit_threads(config.device)
     path = str(config.pretrained_path)
-    policy = get_policy_class(config.type).from_pretrained(
-        path, config=config, revision=config.pretrained_revision
-    )
+    with plain_loading(f"--policy.path={path}"):
+        policy = get_policy_class(config.type).from_pretrained(
+            path, config=config, revision=config.pretrained_revision
+        )
     policy.to(config.device)
     policy.eval()
     overrides = {
         "device_processor": {"device": str(config.device)},
         "rename_observations_processor": {"rename_map": rename_map},
     }
+<<<<<<< HEAD
     pre, post = make_pre_post_processors(
         config,
         pretrained_path=path,
         pretrained_revision=config.pretrained_revision,
         preprocessor_overrides=overrides,
     )
+=======
+    with plain_loading(f"--policy.path={path}"):
+        pre, post = make_pre_post_processors(config, pretrained_path=path, preprocessor_overrides=overrides)
+>>>>>>> wt-err
     return ServedPolicy(policy, pre, post, rename_map, max_batch)
 
 

@@ -24,6 +24,7 @@ from lerobot_roborecover.remote.errors import RemoteError
 from lerobot_roborecover.remote.protocol import pack, unpack
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.sessions import Envelope, RequestError, Sessions, read_envelope
+from lerobot_roborecover.signals import STOP_SIGNALS
 
 logger = logging.getLogger(__name__)
 
@@ -174,7 +175,7 @@ class PolicyServer:
         """Inferences answered."""
 
     async def run(self, ready: Callable[[int], None], stop: asyncio.Event | None = None) -> None:
-        """Serves until `stop` is set, or by default until SIGINT or SIGTERM.
+        """Serves until `stop` is set, or by default until SIGINT, SIGTERM or SIGHUP.
 
         Args:
             ready: called with the port once connections are taken.
@@ -313,13 +314,15 @@ def _bare(host: str) -> str:
 
 
 def _stop_on_signals(stop: asyncio.Event) -> None:
-    """The first Ctrl-C ends the server in good order, the second one at once."""
+    """The first Ctrl-C, SIGTERM or SIGHUP ends the server in good order, the second one at once."""
     loop = asyncio.get_running_loop()
+    # Under nohup, SIGHUP is ignored and is to stay so.
+    numbers = [n for n in STOP_SIGNALS if n != signal.SIGHUP or signal.getsignal(n) is not signal.SIG_IGN]
 
     def end(*_: Any) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             loop.remove_signal_handler(number)
         stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in numbers:
         loop.add_signal_handler(number, end)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -18,6 +17,7 @@ from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_markdown
 from lerobot_roborecover.env.render_device import egl_devices
 from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, ArmResult, ReproductionResult
 from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.workers.capacity import usable_cores
 
 SCHEMA = 1
 MARKDOWN, JSON = "reproduction.md", "reproduction.json"
@@ -103,7 +103,7 @@ def record(result: ReproductionResult) -> dict[str, Any]:
 def machine() -> str:
     """What it ran on, in a line."""
     gpus = sum(not device.software for device in egl_devices())
-    return f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {gpus} GPUs that EGL knows"
+    return f"{platform.system()} {platform.machine()}, {usable_cores()} cores, {gpus} GPUs that EGL knows"
 
 
 def _scores(result: ReproductionResult) -> Table:

@@ -8,16 +8,17 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import IO
 
-from lerobot_roborecover.workers.parent import ends_with_this
+from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""
+_running: set[subprocess.Popen] = set()
 CANNOT_START = "cannot start "
 """What `startable` begins a line with that names a run and says why it cannot be begun."""
 
 
 def run_module(module: str, argv: Sequence[str], kernels: Mapping[str, str], log: IO | None = None) -> int:
-    """Runs `python -m MODULE ARGV`, ended with its parent whatever ends that.
+    """Runs `python -m MODULE ARGV`, which ends with its parent, in good order if possible.
 
     Args:
         module: of the project or of LeRobot.
@@ -28,8 +29,21 @@ def run_module(module: str, argv: Sequence[str], kernels: Mapping[str, str], log
     Returns:
         Its exit status.
     """
-    return subprocess.run(
+    process = subprocess.Popen(
         [sys.executable, "-m", module, *argv],
         stdin=subprocess.DEVNULL, stdout=log, stderr=None if log is None else subprocess.STDOUT,
         env={**DEFAULTS, **os.environ, **kernels}, preexec_fn=ends_with_this(),
-    ).returncode  # fmt: skip
+    )  # fmt: skip
+    _running.add(process)
+    try:
+        return process.wait()
+    except BaseException:
+        stop_children([process])
+        raise
+    finally:
+        _running.discard(process)
+
+
+def stop_running() -> None:
+    """Stops the children that other threads wait for."""
+    stop_children(list(_running))

@@ -17,7 +17,7 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.rounding import has_kernels
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms, report_command
-from lerobot_roborecover.study.child import CANNOT_START, run_module
+from lerobot_roborecover.study.child import CANNOT_START, run_module, stop_running
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import (
     STEPS_BAND,
@@ -26,13 +26,20 @@ from lerobot_roborecover.study.outcomes import (
     outcomes_of,
     read_outcomes,
 )
+<<<<<<< HEAD
 from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
 from lerobot_roborecover.trials.sizes import usable_cores
+=======
+from lerobot_roborecover.trials.sizes import SLOT_GB
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+>>>>>>> wt-err
 
 DONE_FILE = "done.json"
 """Beside the log of an arm that has finished: the run that it was."""
 RUN_FILE = "run.yaml"
 """Beside the log of every arm: its run, as `roborecover eval --config_path` reads it."""
+ARM_GB = 1.0
+"""Memory reckoned for an arm beside its simulator: LeRobot, torch and a small policy."""
 _SHOWN_LINES = 12
 
 
@@ -63,7 +70,8 @@ def evaluate(
         out: folder of the results; a rerun goes on there.
         every: take every n-th scenario.
         slots: simulators at once in each arm; 0: as many as there are cores for it.
-        jobs: arms at once; 0: one per core. A small policy keeps one core busy, and no second.
+        jobs: arms at once; 0: one per core, as far as memory allows. A small policy keeps one core busy, and
+            no second.
         say: takes progress lines.
 
     Returns:
@@ -75,7 +83,7 @@ def evaluate(
     """
     ids = scenario_ids(study, every)
     cores = usable_cores()
-    jobs = jobs or cores
+    jobs = jobs or max(1, min(cores, int(min(available_gb(), 1e6) / (ARM_GB + SLOT_GB))))
     todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
 
     check_arms([arm for arm in todo if not _finished(arm, ids)], study, out)
@@ -94,6 +102,10 @@ def evaluate(
             for number, finished in enumerate(as_completed(running), 1):
                 arm, seconds = running[finished], finished.result()
                 say(f"[{number}/{len(todo)}] {arm.label}: {len(ids) * arm.trials} trials, {seconds:.0f} s")
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            stop_running()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     return todo

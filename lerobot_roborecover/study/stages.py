@@ -13,7 +13,8 @@ from lerobot_roborecover.curation.screen.screening import ScreenRule
 from lerobot_roborecover.datasets.load import builtin_names
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.recipe import StudyRecipe
-from lerobot_roborecover.trials.sizes import usable_cores
+from lerobot_roborecover.trials.sizes import default_slots
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
 CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"
 """Of a training's folder."""
@@ -117,7 +118,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
             tuple(trials / name / "eval_info.json" for name in screening),
         )
     ]  # fmt: skip
-    workers = ("--workers", str(usable_cores()))
+    workers = ("--workers", str(default_slots("cpu", usable_cores(), available_gb())))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(

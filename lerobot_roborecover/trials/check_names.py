@@ -13,9 +13,9 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
+from lerobot_roborecover.policies.load_problems import other_action_width
 from lerobot_roborecover.trials.check_numbers import Stats, statistics_problem
 from lerobot_roborecover.trials.findings import Finding, failure, ok, warning
-from lerobot_roborecover.trials.load_problems import other_action_width
 
 PAPER_HORIZON: Mapping[tuple[str, str], int] = {
     ("pi0", "libero"): 5,

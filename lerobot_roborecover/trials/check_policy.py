@@ -6,10 +6,8 @@ pictures is looked for; what only a score can tell is not.
 """
 
 import json
-import os
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -30,8 +28,10 @@ from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial import action_problem
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, PolicyError
+from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.trials import check_names as names
 from lerobot_roborecover.trials import check_numbers as numbers
 from lerobot_roborecover.trials.findings import (
@@ -43,8 +43,9 @@ from lerobot_roborecover.trials.findings import (
     warning,
 )
 from lerobot_roborecover.trials.load import load_host
-from lerobot_roborecover.trials.load_problems import load_remedy
 from lerobot_roborecover.trials.runner import RecoveryEvalConfig, host_spec
+from lerobot_roborecover.trials.sizes import default_slots
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
 
 SHORT = {"--json": "--check.json=true"}
@@ -151,13 +152,19 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
 
 def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, Run]:
     """The scenarios and a run whose trial log nobody keeps."""
+<<<<<<< HEAD
     folder = tempfile.TemporaryDirectory(prefix="roborecover-check-")
     log = f"{folder.name}/trials.jsonl"
     facts = facts_of(cfg.policy, rename_map=cfg.rename_map, n_episodes=cfg.eval.n_episodes)
+=======
+    folder = TemporaryFolder("check")
+    log = f"{folder.path}/trials.jsonl"
+    facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes)
+>>>>>>> wt-err
     options = copy(cfg.recovery_env)
     options.trial_log = log
     scenarios, run = open_run(options, options.run_spec(), workers=True, facts=facts)
-    run.pool.on_close(folder.cleanup)
+    run.pool.on_close(folder.close)
     return scenarios, run
 
 
@@ -339,7 +346,8 @@ def _estimate(
     cfg: CheckPolicyConfig, host: Host, scenarios: ScenarioSet, scenario: Scenario, steps: FirstSteps
 ) -> list[Finding]:
     """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
-    slots = min(cfg.runner.slots or os.cpu_count() or 1, len(scenarios) * cfg.eval.n_episodes)
+    room = default_slots(str(cfg.given_policy.device), usable_cores(), available_gb())
+    slots = min(cfg.runner.slots or room, len(scenarios) * cfg.eval.n_episodes)
     batch = min(slots, host.max_batch) if host.batched else 1
     alone = statistics.median(steps.infer_s[1:] or steps.infer_s)
     together = alone

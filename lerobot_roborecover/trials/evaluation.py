@@ -8,7 +8,6 @@ loop would change as well, the queue of actions that a policy keeps for itself, 
 from __future__ import annotations
 
 import random
-import tempfile
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -35,6 +34,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.load import HostSpec, load_host, load_processors, policy_config
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
@@ -92,8 +92,8 @@ def evaluate(
     chosen = _scenario_set(scenarios, env)
     options = _env_config(env, chosen.platform)
     module: PreTrainedPolicy | None = policy if isinstance(policy, torch.nn.Module) else None
-    with tempfile.TemporaryDirectory(prefix="roborecover-") as folder, untouched(module):
-        options.trial_log = str(log or Path(folder) / "trials.jsonl")
+    with TemporaryFolder("evaluate") as folder, untouched(module):
+        options.trial_log = str(log or folder / "trials.jsonl")
         config = _policy_config(policy, device)
         spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
         own = () if module is None else _processors(spec, module, processors)
@@ -137,6 +137,7 @@ def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
     modes = [] if policy is None else [(module, module.training) for module in policy.modules()]
     gpus = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
     python, numpy = random.getstate(), np.random.get_state()
+    threads = torch.get_num_threads()
     benchmark, tf32 = torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32
     try:
         with torch.random.fork_rng(devices=gpus):
@@ -147,6 +148,7 @@ def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
         random.setstate(python)
         np.random.set_state(numpy)
         torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32 = benchmark, tf32
+        torch.set_num_threads(threads)
 
 
 def _scenario_set(scenarios: Any, env: Any) -> ScenarioSet:

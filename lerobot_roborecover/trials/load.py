@@ -13,13 +13,16 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_roborecover.env.command_line import plain_parsing
 from lerobot_roborecover.env.configs import RecoveryEnvConfig
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.processors import env_processors
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.host import Host, MakesHost
+from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
 from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.policies.policy_host import PolicyHost
-from lerobot_roborecover.trials.load_problems import load_remedy, other_action_width
+from lerobot_roborecover.policies.threads import fit_threads
 from lerobot_roborecover.trials.portable import make_portable
 
 
@@ -50,18 +53,18 @@ def policy_config(policy: str, options: Sequence[str] = (), device: str | None =
         device: of the policy; None takes what the config says.
 
     Raises:
-        OptionError: there is no such checkpoint.
+        OptionError: there is no such checkpoint, it is not whole, or an option is not one of its policy's.
     """
     import lerobot.policies  # noqa: F401 - registers LeRobot's policy types
 
     from lerobot_roborecover.interventions import configuration_intervention  # noqa: F401 - and ours
-    from lerobot_roborecover.interventions.monitor.files import CONFIG_FILE, find_file
     from lerobot_roborecover.remote import configuration_remote  # noqa: F401
 
-    find_file(policy, CONFIG_FILE)
+    check_checkpoint(policy)
     overrides = [f"--{o.removeprefix('--')}" for o in options]
     overrides += [f"--device={device}"] if device else []
-    config = PreTrainedConfig.from_pretrained(policy, cli_overrides=overrides)
+    with plain_parsing(f"--policy.path={policy}", ValueError, TypeError, KeyError):
+        config = PreTrainedConfig.from_pretrained(policy, cli_overrides=overrides)
     config.pretrained_path = Path(policy)
     return config
 
@@ -70,8 +73,11 @@ def load_host(spec: HostSpec) -> Host:
     """Loads the policy and its processors.
 
     Raises:
-        OptionError: the checkpoint is for another robot, or lacks its processor files.
+        OptionError: the checkpoint is for another robot, lacks its processor files, or is not whole.
     """
+    path = spec.policy.pretrained_path
+    if path is not None and Path(path).is_dir():
+        check_checkpoint(path)
     width = spec.env.features["action"].shape[0]
     other = other_action_width(spec.policy, width)
     if other is not None:
@@ -79,15 +85,8 @@ def load_host(spec: HostSpec) -> Host:
             f"--policy.path={spec.policy.pretrained_path}: its actions have {other} values, {spec.env.type} "
             f"takes {width}. The checkpoint is for another robot or another kind of action"
         )
-    try:
+    with plain_loading(f"--policy.path={path}"):
         return _load_host(spec)
-    except Exception as err:
-        remedy = load_remedy(err)
-        if not remedy:
-            raise
-        raise OptionError(
-            f"--policy.path={spec.policy.pretrained_path}: {err}. What to do: {remedy}"
-        ) from err
 
 
 def _load_host(spec: HostSpec) -> Host:
@@ -95,6 +94,7 @@ def _load_host(spec: HostSpec) -> Host:
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(spec.seed)
+    fit_threads(spec.policy.device)
     rename_map = dict(spec.rename_map)
     policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
     _check_trained(spec.policy, policy)

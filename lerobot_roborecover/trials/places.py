@@ -12,9 +12,10 @@ from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.policies.host import Host
 from lerobot_roborecover.trials.engine import Engine
 from lerobot_roborecover.trials.local import open_local_engine
-from lerobot_roborecover.trials.sizes import available_gb, default_slots, usable_cores
+from lerobot_roborecover.trials.sizes import default_slots
 from lerobot_roborecover.trials.smoke import check_smoke
 from lerobot_roborecover.trials.units import Unit, first_units
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 from lerobot_roborecover.workers.workplace import HERE, Opening, Workplace
 
 

@@ -3,16 +3,14 @@
 import json
 import logging
 import re
-import signal
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -27,6 +25,8 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
@@ -123,6 +123,11 @@ class RecoveryEvalConfig(EvalPipelineConfig):
 
     runner: RunnerOptions = field(default_factory=RunnerOptions)
 
+    def __post_init__(self) -> None:
+        if path := parser.get_path_arg("policy"):
+            check_checkpoint(path)
+        super().__post_init__()
+
     @property
     def recovery_env(self) -> RecoveryEnvConfig:
         """`env`.
@@ -155,7 +160,8 @@ class RecoveryEvalConfig(EvalPipelineConfig):
 
 
 class Stopper:
-    """Says when to stop: after a time limit, or at the first Ctrl-C (the second one kills).
+    """Says when to stop: after a time limit, or at the first Ctrl-C, SIGTERM or SIGHUP. A second one of the
+    same kind ends the process at once.
 
     Args:
         limit_s: seconds from now; 0 for none.
@@ -164,11 +170,13 @@ class Stopper:
     def __init__(self, limit_s: float):
         self._deadline = time.monotonic() + limit_s if limit_s else float("inf")
         self.reason = ""
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self.status = 0
+        """Exit status of a run that stopped before its end."""
+        self._before = handle(STOP_SIGNALS, self._interrupt)
 
-    def _interrupt(self, *_: Any) -> None:
-        self.reason = "interrupted"
-        signal.signal(signal.SIGINT, self._before)
+    def _interrupt(self, number: int, _frame: object) -> None:
+        self.reason, self.status = "interrupted", exit_status(number)
+        put_back({number: self._before.pop(number)})
 
     def __call__(self) -> bool:
         """Whether to stop; `reason` then says why."""
@@ -177,8 +185,8 @@ class Stopper:
         return bool(self.reason)
 
     def restore(self) -> None:
-        """Puts the caller's own signal handler back."""
-        signal.signal(signal.SIGINT, self._before)
+        """Puts the caller's own signal handlers back."""
+        put_back(self._before)
 
 
 def evaluate(cfg: RecoveryEvalConfig) -> int:
@@ -257,7 +265,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
                 f"command with --env.trial_log={log.path} --output_dir={out}",
                 file=sys.stderr,
             )
-            return 130 if stopper.reason == "interrupted" else 0
+            return stopper.status
         if unrun:
             (scenario, trial), reason = next(iter(unrun.items()))
             print(

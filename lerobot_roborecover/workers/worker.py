@@ -13,6 +13,7 @@ import sys
 import traceback
 from multiprocessing.connection import Connection
 
+from lerobot_roborecover.signals import STOP_SIGNALS
 from lerobot_roborecover.workers.messages import Command, Server, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.parent import end_with_parent
 from lerobot_roborecover.workers.transport import Channel
@@ -20,8 +21,9 @@ from lerobot_roborecover.workers.transport import Channel
 
 def main(fd: int, memory: int | None = None) -> None:
     """Serves commands from the inherited socket until the parent closes it."""
-    # The parent decides when to stop: Ctrl-C reaches the whole process group.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The parent decides when to stop: a terminal, and many schedulers, signal the whole process group.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     # A parent that is gone already, or that ends elsewhere than on Linux, shows as the socket's end; a worker
     # stuck in native code would not see that.
     end_with_parent(os.getppid())

@@ -64,7 +64,7 @@ def problems(tmp_path, policy):
         (
             "screen.policies",
             [{"path": "nowhere/at-all"}],
-            "screen.policies.0: checkpoint 'nowhere/at-all' is neither",
+            "screen.policies.0: --policy.path=nowhere/at-all: no LeRobot policy there",
         ),
         ("screen.env", {"obs_typ": "state"}, "screen: "),
         ("screen.env", {"start": "initial"}, "screen: --env start=initial: screening settles this itself"),
@@ -124,7 +124,8 @@ def test_weights_that_were_cut_off_are_found(problems, tmp_path):
     file = cut / "model.safetensors"
     file.write_bytes(file.read_bytes()[:-100])
     (found,) = problems("screen.policies", [{"path": str(cut)}])
-    assert f"{file} cannot be read" in found
+    assert f"{cut}: model.safetensors has" in found
+    assert "it was cut" in found
 
 
 @pytest.mark.lerobot

@@ -6,13 +6,14 @@ import builtins
 import io
 import os
 import pickle
+import re
 import shutil
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.platforms.libero import PLATFORM
+from lerobot_roborecover.platforms.libero import PLATFORM, assets
 from lerobot_roborecover.platforms.libero.assets import (
     ASSETS_VARIABLE,
     find_assets,
@@ -137,3 +138,11 @@ def test_init_states_run_no_code(tmp_path, monkeypatch):
     with pytest.raises(SimulatorError, match="not part of a numpy array"):
         init_states.read_init_states("libero_goal", "bad")
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_download_names_its_commit(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo_id, **options: asked.append(options))
+    assert "incomplete" in assets._download(tmp_path)
+    assert re.fullmatch("[0-9a-f]{40}", asked[0]["revision"])
+    assert asked[0]["local_dir"] == tmp_path

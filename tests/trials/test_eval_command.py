@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ import pytest
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.trials.progress import ProgressLine
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.loop import outcomes
 from tests.support.processes import PATIENCE_S, alive_after, children
@@ -146,9 +148,71 @@ def test_a_time_limit_stops_cleanly_and_says_how_to_go_on(run, whole, capsys):
     assert outcomes(rows_of(out)) == whole
 
 
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """The temporary folder of this process and its children."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return folder
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_stop_signals_leave_a_log_that_a_rerun_completes(
+    run, whole, monkeypatch, capsys, temporary, number, status
+):
+    """A scheduler's, and a closed terminal's; Ctrl-C's is below."""
+    show, shown = ProgressLine.show, []
+
+    def shows(self, *arguments, **options):
+        show(self, *arguments, **options)
+        shown.append(1)
+        if len(shown) == 3:  # before the first trial, and after two
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(ProgressLine, "show", shows)
+    out = run(status=status)
+    assert len(rows_of(out)) == 2
+    assert "interrupted: 2 of 12 trials done; to go on, run the same command" in capsys.readouterr().err
+    assert (out / "eval_info.json").exists()
+    assert list(temporary.glob("roborecover-*")) == []
+    run()
+    assert outcomes(rows_of(out)) == whole
+
+
+def test_a_full_disk_is_one_line_and_keeps_finished_trials(run, whole, tmp_path, monkeypatch, capsys):
+    log = tmp_path / "out" / "trials.jsonl"
+    write = os.write
+
+    def full(number: int, data: bytes) -> int:
+        """Half of the fifth row fits."""
+        done = log.read_bytes().count(b"\n") if log.exists() else 0
+        if done < 4 or not os.path.samestat(os.fstat(number), log.stat()):
+            return write(number, data)
+        if not log.read_bytes().endswith(b"\n"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(number, data[: len(data) // 2])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        out = run(status=2)
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f"roborecover eval: {log}: No space left on device. Make room ")
+    assert line.endswith("Finished trials are kept")
+    finished = log.read_bytes()
+    assert finished.count(b"\n") == 4
+    assert finished.endswith(b"\n"), "no half row"
+    run()
+    assert log.read_bytes().startswith(finished)
+    assert outcomes(rows_of(out)) == whole
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
-def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(run, whole, arguments, tmp_path, how):
+def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(
+    run, whole, arguments, tmp_path, temporary, how
+):
     out = tmp_path / "out"
     log = out / "trials.jsonl"
     command = [sys.executable, "-m", "lerobot_roborecover.cli.main", "eval", *arguments]
@@ -172,12 +236,15 @@ def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(run, whole, argume
         assert "interrupted" in errors
     assert len(simulators) == 2
     assert not alive_after(simulators)
+    left = list(temporary.glob("roborecover-snapshots-*"))
+    assert len(left) == (how is signal.SIGKILL)
     finished = log.read_bytes()
     finished = finished[: finished.rfind(b"\n") + 1]
     assert 2 <= finished.count(b"\n") < COUNT * TRIALS
     run("--env.step_s=0.02")
     assert log.read_bytes().startswith(finished), "a finished trial was lost or repeated"
     assert outcomes(rows_of(out)) == whole
+    assert list(temporary.glob("roborecover-*")) == []
 
 
 def films(out: Path) -> dict[str, int]:

@@ -19,6 +19,7 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.platforms.findings import Status
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.workers.parent import ends_with_this
 
 EXAMPLES_FOLDER = "examples"
 MAX_EXAMPLE_BYTES = 2**23
@@ -50,6 +51,7 @@ class Examples:
             self._process = subprocess.Popen(
                 [*module, platform, str(self._rendered)],
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                preexec_fn=ends_with_this(),
             )  # fmt: skip
 
     @property

@@ -20,7 +20,8 @@ from lerobot_roborecover.env.run import PlatformPart
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.progress import ProgressLine
-from lerobot_roborecover.trials.sizes import usable_cores
+from lerobot_roborecover.trials.sizes import default_slots
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 from lerobot_roborecover.workers.dispatch import failed
 from lerobot_roborecover.workers.slots import SlotPool
 from lerobot_roborecover.workers.workplace import Opening
@@ -111,7 +112,9 @@ def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
         opening = Opening(partial(node_drawing, "auto"))
         if not options.workplace.on_cluster:
             pool.configure(environment=render_environment("auto", options.device or "cpu", egl_devices()))
-    return options.workplace.settle(pool, options.slots, usable_cores(), opening)
+    return options.workplace.settle(
+        pool, options.slots, default_slots("cpu", usable_cores(), available_gb()), opening
+    )
 
 
 def _run_policy(

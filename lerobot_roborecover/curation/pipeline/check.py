@@ -113,7 +113,6 @@ def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
         OptionError: it cannot; says why.
     """
     from lerobot.policies import get_policy_class
-    from safetensors import SafetensorError, safe_open
 
     from lerobot_roborecover.trials.load import policy_config
 
@@ -124,12 +123,6 @@ def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
         raise
     except Exception as err:  # draccus, LeRobot and what a policy imports raise types of their own
         raise OptionError(f"{path} cannot be loaded: {type(err).__name__}: {err!s:.300}") from None
-    for file in sorted(Path(path).glob("*.safetensors")):
-        try:
-            with safe_open(file, "pt") as weights:
-                weights.keys()
-        except (SafetensorError, OSError) as err:
-            raise OptionError(f"{file} cannot be read: {err}; copy or train the checkpoint again") from None
 
 
 def _check_folders(problems: _Problems, places: Places) -> None:

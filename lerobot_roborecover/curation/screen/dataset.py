@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.whole import check_new
 from lerobot_roborecover.words import counted, next_line
 from lerobot_roborecover.workers.workplace import HERE, Workplace
@@ -135,8 +135,8 @@ def screen_dataset(
                 take_trials(other / policy.name, folder)
         if request.retry:
             forget_trials(folder, request.retry)
-    with tempfile.TemporaryDirectory(prefix="roborecover-screen-") as snapshots:
-        rows = _trials(request, scenarios, Path(snapshots), progress)
+    with TemporaryFolder("screen") as snapshots:
+        rows = _trials(request, scenarios, snapshots, progress)
     if request.shard:
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic)

@@ -8,7 +8,6 @@ twice, the second time by other processes and in the opposite order.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Scenario, ScenarioError
+from lerobot_roborecover.temporary import TemporaryFolder
 from lerobot_roborecover.whole import new_folder
 from lerobot_roborecover.workers.workplace import HERE, Workplace
 
@@ -62,11 +62,11 @@ def write_states(
     """
     workplace.check()
     scenarios, manifest = read_with_manifest(root)
-    with tempfile.TemporaryDirectory() as work:
+    with TemporaryFolder("states") as work:
 
         def replay(order: Sequence[Scenario], turn: int) -> list[Replayed]:
             return fingerprint_scenarios(
-                order, Path(work) / f"{turn}.jsonl", options={"obs_type": "state"}, workers=workers,
+                order, work / f"{turn}.jsonl", options={"obs_type": "state"}, workers=workers,
                 workplace=workplace,
                 progress=lambda done, total: progress(turn * total + done, 2 * total),
             )  # fmt: skip

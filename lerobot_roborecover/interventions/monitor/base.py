@@ -8,7 +8,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
 from lerobot_roborecover.interventions.monitor_interface import Verdicts
+from lerobot_roborecover.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
@@ -167,8 +167,8 @@ class MonitorRewardModel(PreTrainedRewardModel):
         """
         api = HfApi()
         repo_id = api.create_repo(self.config.repo_id, private=self.config.private, exist_ok=True).repo_id
-        with TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
-            folder = Path(temporary) / "monitor"
+        with TemporaryFolder("upload") as temporary:
+            folder = temporary / "monitor"
             self.save_pretrained(folder)
             cfg.save_pretrained(folder)
             (folder / "README.md").write_text(self.card(cfg.dataset.repo_id), encoding="utf-8")

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
+from lerobot_roborecover.policies.checkpoint import check_file
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
@@ -26,17 +28,26 @@ def find_file(path: str | Path, name: str, revision: str | None = None) -> Path:
                 f"{folder} has no {name}: it is not a complete checkpoint; it holds {there}. A "
                 "training run's checkpoint is its checkpoints/last/pretrained_model folder"
             )
-        return folder / name
+        return _whole(folder / name, str(path))
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
     try:
-        return Path(hf_hub_download(str(path), name, revision=revision))
+        return _whole(Path(hf_hub_download(str(path), name, revision=revision)), str(path))
     except (HFValidationError, HfHubHTTPError, LocalEntryNotFoundError) as err:
         raise MonitorError(
             f"checkpoint {str(path)!r} is neither a folder nor a Hub model with {name} "
             f"({type(err).__name__}). Check the spelling, the revision, and `hf auth login` for a private one"
         ) from err
+
+
+def _whole(file: Path, label: str) -> Path:
+    """The file, checked: a pointer, or one that was cut, would be an error of torch's or LeRobot's."""
+    try:
+        check_file(file, label)
+    except OptionError as err:
+        raise MonitorError(str(err)) from None
+    return file
 
 
 def read_trained_on(path: str | Path, revision: str | None = None) -> dict[str, Any]:

@@ -11,17 +11,21 @@ import hashlib
 import importlib.util
 import os
 import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.temporary import TemporaryFolder
+from lerobot_roborecover.whole import write_whole
 
 ASSETS_VARIABLE = "ROBORECOVER_LIBERO_ASSETS"
 """Environment variable that names the asset folder."""
 HUB_REPOSITORY = "lerobot/libero-assets"
 """Where hf-libero downloads its assets from (libero/libero/utils/download_utils.py)."""
+HUB_REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
+"""The commit that is downloaded: its address is a hash of all of its files."""
 
 _MODELS = {
     "articulated_objects/{}.xml": "flat_stove microwave white_cabinet wooden_cabinet",
@@ -98,7 +102,7 @@ def find_assets(option: str | None = None, *, download: bool = True) -> Path:
     raise SimulatorError(
         f"LIBERO's assets are not on this machine: looked at {'; '.join(tried)}; {failure}. Set "
         f"--env.assets_dir or ${ASSETS_VARIABLE} to a folder that holds them, or download them with: "
-        f"hf download {HUB_REPOSITORY} --repo-type dataset --local-dir {cache}"
+        f"hf download {HUB_REPOSITORY} --repo-type dataset --revision {HUB_REVISION} --local-dir {cache}"
     )
 
 
@@ -207,19 +211,19 @@ def _private_config(assets: Path) -> Path:
         }.items()
     )
     name = f"libero-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    base = cache_folder()
+    folder = cache_folder() / name
     try:
-        base.mkdir(parents=True, exist_ok=True)
-        folder = base / name
-        folder.mkdir(exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False, encoding="utf-8") as file:
-            file.write(text)
+        write_whole(folder / "config.yaml", text)
     except OSError:  # no writable home, as in some containers
-        folder = Path(tempfile.mkdtemp(prefix=f"{name}-"))
-        (folder / "config.yaml").write_text(text, encoding="utf-8")
-        return folder
-    os.replace(file.name, folder / "config.yaml")
+        folder = _own_config().path
+        write_whole(folder / "config.yaml", text)
     return folder
+
+
+@cache
+def _own_config() -> TemporaryFolder:
+    """A folder of this process alone, for as long as it lives."""
+    return TemporaryFolder("libero")
 
 
 def _download(folder: Path) -> str:
@@ -228,7 +232,7 @@ def _download(folder: Path) -> str:
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        snapshot_download(repo_id=HUB_REPOSITORY, repo_type="dataset", local_dir=folder)
+        snapshot_download(HUB_REPOSITORY, repo_type="dataset", revision=HUB_REVISION, local_dir=folder)
     except (OSError, ValueError, HfHubHTTPError) as err:
         return (
             f"downloading {HUB_REPOSITORY} failed ({' '.join(str(err).split())[:200] or type(err).__name__})"

@@ -9,8 +9,6 @@ texture picture, is near on it: in the same chart (a piece on which it is contin
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 import zipfile
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
@@ -23,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.whole import new_file
 
 _VERSION = "1"
 """Of what `decimate` makes; another one leaves the cache's entries unread."""
@@ -84,11 +83,9 @@ def cached_decimation(surface: Surface, faces: int, folder: Path) -> Surface:
             return Surface(*(entry[field.name] for field in fields(Surface)))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         made = decimate(surface, faces)
-    with suppress(OSError):  # no writable cache, as in some containers: made at every load
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
-            np.savez(file, **{field.name: getattr(made, field.name) for field in fields(Surface)})
-        os.replace(file.name, path)
+    # Without a writable cache, as in some containers, it is made at every load.
+    with suppress(OSError), new_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **{field.name: getattr(made, field.name) for field in fields(Surface)})
     return made
 
 

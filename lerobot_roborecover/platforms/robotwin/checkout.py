@@ -26,6 +26,8 @@ EMBODIMENT = "aloha-agilex"
 
 ASSETS_REPO = "TianxingChen/RoboTwin2.0"
 """Where RoboTwin keeps its assets on the Hub (its `assets/_download.py`)."""
+ASSETS_REVISION = "981c92aa34d8f94d4cff47e0d5bc2f7d4e0af042"
+"""The commit that remedies name; `docker/robotwin.Dockerfile` has its archives' hashes, too."""
 
 _HINT = (
     "Clone https://github.com/RoboTwin-Platform/RoboTwin, download its assets, and name the checkout with "
@@ -137,7 +139,7 @@ class RobotwinCheckout:
         """
         return (
             f"cd {self.root / 'assets'} && hf download {ASSETS_REPO} {archive}.zip --repo-type dataset "
-            f"--local-dir . && unzip -q {archive}.zip && rm {archive}.zip"
+            f"--revision {ASSETS_REVISION} --local-dir . && unzip -q {archive}.zip && rm {archive}.zip"
         )
 
     def missing_objects(self, task: str) -> list[str]:

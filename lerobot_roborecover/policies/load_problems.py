@@ -1,0 +1,77 @@
+"""Why a checkpoint cannot be evaluated, in words, where LeRobot's own say little."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.utils.constants import ACTION
+
+from lerobot_roborecover.errors import OptionError, RoboRecoverError
+
+
+def load_remedy(err: Exception) -> str:
+    """What to do about an error that loading raised; empty where its own message is the best there is."""
+    text, kind = str(err).lower(), {c.__name__ for c in type(err).__mro__}
+    if "error(s) in loading state_dict" in text:
+        return "config.json and the weights are of different policies, or of another LeRobot: copy both again"
+    if "processor" in text and (
+        "not found" in text or "migrat" in text or isinstance(err, FileNotFoundError)
+    ):
+        return (
+            "the checkpoint has no processor files (policy_preprocessor.json, policy_postprocessor.json). "
+            "Take them from where it was trained, or migrate an old one: python -m "
+            "lerobot.processor.migrate_policy_normalization --pretrained-path CHECKPOINT"
+        )
+    if "feature" in text and "mismatch" in text:
+        return (
+            "the checkpoint's cameras have other names than the env's: give --rename_map, or it is for "
+            "another robot"
+        )
+    if "SafetensorError" in kind:
+        return "its weights are damaged: copy or download the checkpoint again"
+    if kind & {"HfHubHTTPError", "LocalEntryNotFoundError", "HFValidationError"} or "huggingface hub" in text:
+        return "check the spelling, the network, HF_HUB_OFFLINE, and hf auth login for a private model"
+    if isinstance(err, ImportError):
+        return "install what it names: pip install 'lerobot_env_roborecover[policies]' has LeRobot's families"
+    if kind & {"OutOfMemoryError", "MemoryError"}:
+        return "free memory there, or take another --policy.device"
+    if isinstance(err, FileNotFoundError) and err.errno is not None:
+        return "the checkpoint is not whole: copy or download it again"
+    return ""
+
+
+@contextmanager
+def plain_loading(label: str) -> Generator[None]:
+    """Raises what loading a checkpoint fails with as one line, wherever there is a remedy to say.
+
+    Args:
+        label: names the checkpoint.
+
+    Raises:
+        OptionError: in the words of the error, with the remedy.
+    """
+    try:
+        yield
+    except RoboRecoverError:
+        raise
+    except Exception as err:  # policies, and what they import, raise types of their own
+        remedy = load_remedy(err)
+        if not remedy:
+            raise
+        raise OptionError(f"{label}: {' '.join(str(err).split()):.300}. What to do: {remedy}") from err
+
+
+def other_action_width(config: PreTrainedConfig, width: int) -> int | None:
+    """The action width of a checkpoint for another robot; None where it fits, or does not say.
+
+    Args:
+        config: the checkpoint's configuration, before `make_policy` replaces its output by the env's.
+        width: the env's.
+    """
+    feature = (getattr(config, "output_features", None) or {}).get(ACTION)
+    if feature is None or getattr(config, "type", "") == "xvla":  # X-VLA's 20 values are converted
+        return None
+    own = int(feature.shape[0])
+    return None if own in (width, getattr(config, "max_action_dim", width)) else own
