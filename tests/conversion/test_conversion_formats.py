@@ -7,6 +7,7 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
@@ -14,6 +15,7 @@ from lerobot_roborecover.datasets.trajectories import read_exact, read_trajector
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.conversion_scripts import script
+from tests.support.lerobot_folders import STEPS, lerobot_folder, write_tasks
 
 h5py = pytest.importorskip("h5py", reason="no h5py: pip install 'lerobot_env_roborecover[hdf5]'")
 pytestmark = pytest.mark.lerobot
@@ -305,6 +307,40 @@ def test_a_dataset_without_no_ops_and_with_another_width_is_told_apart(recorded,
         convert([str(tmp_path), "--platform", "metaworld", *common[:2], "--out", str(tmp_path / "o2")]) == 2
     )
     assert "meta/info.json" in capsys.readouterr().err
+
+
+def convert_rollouts(root, out):
+    return script("lerobot_rollouts").main(
+        [str(root), "--platform", "metaworld", "--driver", "act", "--out", str(out)]
+    )
+
+
+def test_rollouts_are_of_the_task_of_their_index_wherever_its_row_is(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    names = ["button-press-v3", "door-open-v3", "drawer-close-v3"]
+    tasks = [task_by_name("metaworld", name).instruction for name in names]
+    root = lerobot_folder(tmp_path / "recording", tasks)
+    write_tasks(root, [tasks[i] for i in (2, 0, 1)], [2, 0, 1])
+    assert convert_rollouts(root, tmp_path / "out") == 0
+    assert [r.task["name"] for r in read_trajectories(tmp_path / "out").rows] == names
+    dataset = LeRobotDataset("lab/x", root=tmp_path / "out")
+    assert [dataset[i * STEPS]["task"] for i in range(3)] == tasks, "LeRobot counts the rows"
+
+
+@pytest.mark.parametrize("column", ["named so", "in the data alone"])
+def test_a_column_actions_is_refused_in_one_line(tmp_path, capsys, column):
+    root = lerobot_folder(tmp_path / "recording", ["open it"])
+    info, data = root / "meta" / "info.json", root / "data" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(data)
+    names = ["actions" if n == "action" else n for n in table.column_names]
+    pq.write_table(table.rename_columns(names), data)
+    if column == "named so":
+        info.write_text(info.read_text().replace('"action"', '"actions"'))
+    assert convert_rollouts(root, tmp_path / "out") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "actions" in said
+    assert "ename" in said or "Give them the same names" in said
 
 
 def test_tasks_are_found_by_name_and_by_instruction():
