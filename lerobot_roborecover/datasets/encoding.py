@@ -150,7 +150,7 @@ class EpisodeWriter:
 
         Raises:
             ScenarioError: it has not one frame before each action, or a camera's film another number of
-                frames than that.
+                frames than that; or its columns are not those of the first episode.
         """
         dataset, steps, written = self._dataset, len(episode.actions), 0
         for frame in episode.frames:
@@ -161,16 +161,24 @@ class EpisodeWriter:
                 dataset = self._dataset = self._create(episode, frame)
             action = episode.actions[written]
             own = {k: np.array([v[written]], dtype=_dtype(v)) for k, v in episode.columns.items()}
-            dataset.add_frame(
-                {
-                    **frame,
-                    "action": action.astype(np.float32),
-                    EXACT_ACTION: action,
-                    SCENARIO_INDEX: np.array([episode.scenario_index], dtype=np.int64),
-                    "task": episode.instruction,
-                    **own,
-                }
-            )
+            row = {
+                **frame,
+                "action": action.astype(np.float32),
+                EXACT_ACTION: action,
+                SCENARIO_INDEX: np.array([episode.scenario_index], dtype=np.int64),
+                "task": episode.instruction,
+                **own,
+            }
+            try:
+                dataset.add_frame(row)
+            except ScenarioError:
+                raise
+            except ValueError as err:
+                raise ScenarioError(
+                    f"{episode.name}, step {written}: its columns are not those of the first episode "
+                    f"({' '.join(str(err).split())[:300]}); write episodes with other cameras or shapes as a "
+                    "dataset of their own"
+                ) from err
             written += 1
         if dataset is None or written != steps or not written:
             raise ScenarioError(
