@@ -20,6 +20,7 @@ import numpy as np
 from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id, open_lerobot_folder
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
@@ -57,16 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def convert(args: argparse.Namespace) -> list[TrajectoryRow]:
     """Copies the dataset with our columns added."""
-    from lerobot.datasets.dataset_tools import add_features
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     check_new(args.out)
-    if not (args.dataset / "meta" / "info.json").is_file():
-        raise ScenarioError(
-            f"{args.dataset} has no meta/info.json; name the folder of a LeRobotDataset (v3.0)"
-        )
+    source = open_lerobot_folder(args.dataset)
     check_frames(args.dataset, thorough=True)
-    source = LeRobotDataset("roborecover/source", root=args.dataset)
+    from lerobot.datasets.dataset_tools import add_features
+
     rows, actions = read_rows(source, args)
     added = {
         EXACT_ACTION: (actions, {"dtype": "float64", "shape": (actions.shape[1],), "names": None}),
@@ -76,7 +72,7 @@ def convert(args: argparse.Namespace) -> list[TrajectoryRow]:
         ),
     }
     with new_folder(args.out) as folder:
-        add_features(source, added, output_dir=folder, repo_id=f"roborecover/{args.out.name}")
+        add_features(source, added, output_dir=folder, repo_id=local_repo_id(args.out))
         write_metadata(
             folder, "rollouts", [], rows, description="Recorded rollouts, converted.", license=args.license
         )
@@ -90,15 +86,26 @@ def read_rows(source: Any, args: argparse.Namespace) -> tuple[list[TrajectoryRow
         raise ScenarioError(
             f"{args.dataset} has a column {EXACT_ACTION} already: it is a dataset of this package"
         )
-    width = features["action"]["shape"][0] if "action" in features else None
-    if width not in platform_named(args.platform).action_widths:
+    if "action" not in features:
+        others = sorted(n for n in features if not n.startswith("observation"))
         raise ScenarioError(
-            f"{args.dataset}: actions have width {width}; {args.platform} takes "
+            f"{args.dataset} has no column action, only {others}. Rename the one that holds the actions, in "
+            "meta/info.json, data/*/*.parquet and meta/stats.json"
+        )
+    shape = list(features["action"]["shape"])
+    if len(shape) != 1 or shape[0] not in platform_named(args.platform).action_widths:
+        raise ScenarioError(
+            f"{args.dataset}: actions have width {', '.join(map(str, shape))}; {args.platform} takes "
             f"{' or '.join(map(str, platform_named(args.platform).action_widths))}"
         )
     names = ["action", "episode_index", "task_index", *(n for n in ("next.success",) if n in features)]
     table = source.hf_dataset.with_format("arrow").select_columns(names)[:]
-    actions = np.array(table["action"].to_pylist(), dtype=np.float64)
+    try:
+        actions = np.array(table["action"].to_pylist(), dtype=np.float64).reshape(-1, shape[0])
+    except (TypeError, ValueError):
+        raise ScenarioError(
+            f"{args.dataset}: column action is not {shape[0]} numbers in every frame. Record it again"
+        ) from None
     if not np.isfinite(actions).all():
         raise ScenarioError(
             f"{args.dataset}: row {np.argwhere(~np.isfinite(actions))[0][0]}, action is not finite"

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.cli.guard import guarded
-from lerobot_roborecover.datasets.converted import write_converted
+from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
-from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array
+from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array, read_group
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.task_lookup import task_by_name
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
@@ -27,6 +27,11 @@ from lerobot_roborecover.scenario import ScenarioError, Task
 
 CAMERAS = (("agentview_rgb", "agentview_image"), ("eye_in_hand_rgb", "robot0_eye_in_hand_image"))
 """By LeRobot's `image` and `image2`: LIBERO's own names and robomimic's."""
+
+NO_OBS = (
+    "raw demonstrations have no observations. Render them with LIBERO's scripts/create_dataset.py, or "
+    "robomimic's dataset_states_to_obs.py"
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,7 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return write_converted(
         "libero_hdf5",
         args.out,
-        lambda failed: (t for path in args.files for t in episodes(path, args.suite, args.driver, failed)),
+        lambda failed: each_source(
+            args.files, lambda path: episodes(path, args.suite, args.driver, failed), failed
+        ),
         fps=20,
         description="LIBERO demonstrations, converted.",
         license=args.license,
@@ -55,14 +62,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def episodes(path: Path, suite: str, driver: str, failed: list[str]) -> Iterator[Trajectory]:
     """The demonstrations of one file; those that fail are described in `failed`."""
     with open_hdf5(path) as file:
-        if "data" not in file:
-            raise ScenarioError(f"{path} has no group data; it is not a LIBERO or robomimic file")
-        bddl = PurePosixPath(str(file["data"].attrs.get("bddl_file_name", ""))).stem
+        data = read_group(file, "data", "it is not a LIBERO or robomimic file")
+        bddl = PurePosixPath(str(data.attrs.get("bddl_file_name", ""))).stem
         task = task_by_name("libero", bddl or path.stem.removesuffix("_demo"), suite=suite)
         states = read_init_states(task.suite, task.name)
-        for name in episode_names(file["data"], "demo_"):
+        for name in episode_names(data, "demo_"):
             try:
-                yield trajectory(file["data"][name], name, path, task, states, driver)
+                yield trajectory(read_group(data, name), name, path, task, states, driver)
             except ScenarioError as err:
                 failed.append(str(err))
 
@@ -90,7 +96,7 @@ def trajectory(demo: Any, name: str, path: Path, task: Task, states: np.ndarray,
         task=task,
         driver=driver,
         actions=actions.astype(np.float64),
-        frames=list(frames(demo["obs"], len(actions))),
+        frames=list(frames(read_group(demo, "obs", NO_OBS), len(actions))),
         success=bool(rewards[-1] > 0),
         not_replayable="; ".join(reasons),
         provenance={"file": path.name, "episode": name, "init_state_index": index},

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.cli.guard import guarded
-from lerobot_roborecover.datasets.converted import write_converted
-from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array
+from lerobot_roborecover.datasets.converted import each_source, write_converted
+from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array, read_group
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.release.tables import read_file
 from lerobot_roborecover.datasets.task_lookup import task_by_name
@@ -54,8 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return write_converted(
         "robotwin_hdf5",
         args.out,
-        lambda failed: (
-            t for folder in args.folders for t in episodes(folder, args.instruction_type, failed)
+        lambda failed: each_source(
+            args.folders, lambda folder: episodes(folder, args.instruction_type, failed), failed
         ),
         fps=args.fps,
         description="RoboTwin's saved episodes, converted; action is the next joint state.",
@@ -70,10 +70,9 @@ def episodes(folder: Path, kind: str, failed: list[str]) -> Iterator[Trajectory]
         raise ScenarioError(
             f"{folder} has no data/episode*.hdf5; name a TASK/CONFIG folder of RoboTwin's data"
         )
-    seeds = (folder / "seed.txt").read_text().split() if (folder / "seed.txt").is_file() else []
     for path in paths:
-        number = int(path.stem.removeprefix("episode"))
         try:
+            number = int(path.stem.removeprefix("episode"))
             said = instruction(folder, number, kind)
             where = folder.resolve()
             task = task_by_name("robotwin", where.parent.name, said, where.name)
@@ -93,11 +92,26 @@ def episodes(folder: Path, kind: str, failed: list[str]) -> Iterator[Trajectory]
                     provenance={
                         "file": path.name,
                         "config": folder.name,
-                        "seed": int(seeds[number]) if number < len(seeds) else None,
+                        "seed": seed_of(folder, number),
                     },
                 )
-        except (ScenarioError, ValueError) as err:
+        except (ScenarioError, ValueError, RecursionError) as err:
             failed.append(f"{path}: {err}")
+
+
+def seed_of(folder: Path, number: int) -> int | None:
+    """An episode's seed, where it is recorded."""
+    if not (folder / "seed.txt").is_file():
+        return None
+    words = read_file(folder, PurePosixPath("seed.txt"), MAX_JSON_BYTES).decode(errors="replace").split()
+    if number >= len(words):
+        return None
+    try:
+        return int(words[number])
+    except ValueError:
+        raise ScenarioError(
+            f"seed.txt: {words[number]!r:.80} is not a whole number; it holds one an episode, as UTF-8"
+        ) from None
 
 
 def instruction(folder: Path, number: int, kind: str) -> str:
@@ -112,10 +126,11 @@ def instruction(folder: Path, number: int, kind: str) -> str:
 
 def frames(file: Any, joints: np.ndarray) -> Iterator[Frame]:
     """Observations under the names of LeRobot's RoboTwin env; the last state has no action, and no frame."""
+    observation = read_group(file, "observation")
     pictures = {
-        c: read_array(file, f"observation/{c}/rgb", ndim=1, rows=(len(joints), "joint states"))
+        c: read_array(observation, f"{c}/rgb", ndim=1, rows=(len(joints), "joint states"))
         for c in CAMERAS
-        if c in file["observation"]
+        if c in observation
     }
     for i in range(len(joints) - 1):
         yield {

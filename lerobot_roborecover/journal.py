@@ -18,7 +18,9 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from lerobot_roborecover.errors import naming
+from lerobot_roborecover.file_locks import LockResult, lock_file
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import sync_folder
 
 MAX_JOURNAL_BYTES = 2**28
 _BLOCK = 2**16
@@ -38,10 +40,11 @@ def open_locked(path: Path, mode: str) -> IO[Any]:
     path.parent.mkdir(parents=True, exist_ok=True)
     file = open(path, mode)  # noqa: SIM115 - lives as long as whoever asked
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
+            raise InUseError(f"{path} is in use by another process")
+    except BaseException:
         file.close()
-        raise InUseError(f"{path} is in use by another process") from None
+        raise
     return file
 
 
@@ -60,11 +63,7 @@ class AppendOnly:
         self.path = path
         self._file = open_locked(path, "a+b")
         # A file that was just made is only there after a crash once its folder is on disk, too.
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(path.parent)
 
     def lines(self, longest: int | None = None) -> Iterator[bytes]:
         """See `complete_lines`."""

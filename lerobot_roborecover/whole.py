@@ -2,23 +2,29 @@
 
 Each is written under a name of its own beside its place, `.NAME.PROCESS.tmp`. A process that is killed leaves
 that behind; whoever writes NAME next takes it away. That nobody is at work on a folder any more is known by a
-lock (`.NAME.PROCESS.lock`), which the system lets go of with the process, on whichever machine it ran.
+lock (`.NAME.PROCESS.lock`), which the system lets go of with the process, on whichever machine it ran. The
+lock file also names the machine and when the process began, for file systems without locks.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import glob
 import os
 import re
 import shutil
+import socket
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from lerobot_roborecover.errors import naming
+from lerobot_roborecover.file_locks import LockResult, lock_file
 from lerobot_roborecover.scenario import ScenarioError
+
+_DEAD_AFTER_S = 7 * 86400
 
 
 @contextmanager
@@ -36,7 +42,7 @@ def new_file(path: Path) -> Generator[Path]:
         temporary.unlink(missing_ok=True)
         raise
     # The name is only there after a crash once its folder is on disk, too.
-    _to_disk(path.parent)
+    sync_folder(path.parent)
 
 
 def write_whole(path: Path, data: str | bytes) -> None:
@@ -73,10 +79,12 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     temporary, old, lock = (
         root.with_name(f".{root.name}.{os.getpid()}.{kind}") for kind in ("tmp", "old", "lock")
     )
-    shutil.rmtree(temporary, ignore_errors=True)
     with open(lock, "a") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
         try:
+            lock_file(held, fcntl.LOCK_EX)
+            held.write(_identity(os.getpid()))
+            held.flush()
+            shutil.rmtree(temporary, ignore_errors=True)
             yield from _at(root, temporary, old, replace)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -115,10 +123,13 @@ def forget_stale(root: Path) -> list[Path]:
         return []
     # A writer within a writer has `..NAME.1.tmp.1.tmp`.
     left = re.compile(rf"\.+{re.escape(root.name)}((?:\.[0-9]+\.tmp)*)\.([0-9]+)\.(tmp|old|lock)")
+    leftovers = [(path, m) for path in sorted(root.parent.iterdir()) if (m := left.fullmatch(path.name))]
+    # Asked once for each writer, while its lock file is still there.
+    writers = {path.with_suffix(".lock"): int(found[2]) for path, found in leftovers}
+    at_work = {lock for lock, process in writers.items() if _at_work(lock, process)}
     gone = []
-    for path in sorted(root.parent.iterdir()):
-        found = left.fullmatch(path.name)
-        if found is None or _at_work(path.with_suffix(".lock"), int(found[2])):
+    for path, found in leftovers:
+        if path.with_suffix(".lock") in at_work:
             continue
         if found[3] == "old" and not found[1] and not root.exists():
             os.replace(path, root)
@@ -131,15 +142,36 @@ def forget_stale(root: Path) -> list[Path]:
 
 
 def _at_work(lock: Path, process: int) -> bool:
-    """Whether a writer is at work: it holds its lock, or, without one, lives on this machine."""
+    """Whether the writer that made a lock file is at work.
+
+    A lock that is held says so. Without a lock file, the writer's process on this machine decides; without
+    locks in the file system, whether that process is still the one that made the file. A writer of another
+    machine, which cannot be asked then, counts as dead after `_DEAD_AFTER_S`.
+    """
     try:
-        with open(lock, "rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            return False
+        with open(lock, encoding="utf-8", errors="replace") as file:
+            result = lock_file(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            if result is not LockResult.UNSUPPORTED:
+                return result is LockResult.IN_USE
+            made_by, age_s = file.read(), time.time() - os.fstat(file.fileno()).st_mtime
     except FileNotFoundError:
         return process != os.getpid() and _lives(process)
     except OSError:
         return True
+    host = f"{socket.gethostname()}\n"
+    if not made_by.startswith(host):
+        return age_s < _DEAD_AFTER_S
+    return process != os.getpid() and _lives(process) and _identity(process) in (made_by, host)
+
+
+def _identity(process: int) -> str:
+    """Names a process of this machine, so that a later one with the same number is told from it."""
+    try:
+        # Field 22 is when it began; the name in field 2 may hold spaces and brackets.
+        began = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        began = ""  # no /proc: its number alone
+    return f"{socket.gethostname()}\n{began}"
 
 
 def _lives(process: int) -> bool:
@@ -161,6 +193,16 @@ def _forget_files(path: Path) -> None:
                 left.unlink(missing_ok=True)
         except OSError:
             continue  # another process was first
+
+
+def sync_folder(path: Path) -> None:
+    """Waits until a folder's names are on disk, where its file system can say so."""
+    try:
+        _to_disk(path)
+    except OSError as err:
+        # Some network file systems cannot sync a folder; SQLite goes on there as well.
+        if err.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):
+            raise
 
 
 def _to_disk(path: Path) -> None:

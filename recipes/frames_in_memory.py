@@ -45,7 +45,8 @@ class FramesInMemory:
         episodes = reader._meta.episodes
         self._bounds = np.stack([episodes["dataset_from_index"], episodes["dataset_to_index"]], axis=1)
         self._deltas = {key: np.array(steps) for key, steps in (reader.delta_indices or {}).items()}
-        self._tasks = list(reader._meta.tasks.index)
+        tasks = reader._meta.tasks
+        self._tasks = dict(zip(tasks["task_index"].tolist(), tasks.index, strict=True))
         self._transform = reader._image_transforms
         # Where an episode's frames begin among those that were loaded (all of them, or some episodes').
         loaded = self._columns["index"].numpy()
@@ -70,7 +71,7 @@ class FramesInMemory:
             for row in range(len(rows)):
                 for key in self._cameras:
                     batch[key][row] = self._transform(batch[key][row])
-        batch["task"] = [self._tasks[task] for task in batch["task_index"]]
+        batch["task"] = [self._tasks[task] for task in batch["task_index"].tolist()]
         return batch
 
 

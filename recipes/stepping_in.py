@@ -22,6 +22,7 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Scenario
 from recipes.commands import evaluate, roborecover
@@ -135,7 +136,7 @@ class SteppingIn:
             )  # fmt: skip
         training = Training(
             Path("policies/train/correction_act.yaml"), donors, self.out / "correction_training",
-            options=(f"--policy.path={base}", "--dataset.repo_id=local/donors"),
+            options=(f"--policy.path={base}", f"--dataset.repo_id={local_repo_id(donors)}"),
         )  # fmt: skip
         roborecover("export-ema", training.train(), "--out", made)
         return made

@@ -64,6 +64,19 @@ if [[ "${1:-}" == --lerobot-main ]]; then
     }
     venv=.venv-main
 fi
+# One at a time in a clone: two demos that are started together would install over each other.
+if command -v flock >/dev/null; then
+    mkdir -p .tools
+    echo '*' >.tools/.gitignore
+    exec 9>>.tools/setup.lock
+    # Status 1: it is held. Any other: the file system has no locks, and setup goes on without.
+    status=0
+    flock --nonblock 9 2>/dev/null || status=$?
+    if ((status == 1)); then
+        say "another setup is at work in this clone; waiting for it"
+        flock 9
+    fi
+fi
 install_system_packages "${system_packages[@]}"
 scripts/vulkan.sh >/dev/null || say "no software Vulkan: without a GPU, RoboTwin renders nothing here"
 

@@ -115,7 +115,7 @@ def merge_candidates(root: str | os.PathLike[str], sources: Sequence[Path]) -> P
     folders = [s.root for s in sets]
     votes = gather_votes(folders, root, {c.id for c in candidates})
     with new_folder(root) as folder:
-        join_datasets(folder, folders, [row.steps for row in rows], root.name)
+        join_datasets(folder, folders, [row.steps for row in rows])
         check_candidates(str(root), candidates, rows)
         write_metadata(
             folder,

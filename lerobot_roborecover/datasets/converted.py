@@ -50,6 +50,23 @@ def write_converted(
     return int(bool(failed))
 
 
+def each_source(
+    sources: Sequence[Path], episodes: Callable[[Path], Iterator[Trajectory]], failed: list[str]
+) -> Iterator[Trajectory]:
+    """Yields the trajectories of files or folders; one that cannot be read does not stop the others.
+
+    Args:
+        sources: files or folders.
+        episodes: yields the trajectories of one.
+        failed: takes what is wrong with a source that is left out.
+    """
+    for source in sources:
+        try:
+            yield from episodes(source)
+        except (ScenarioError, SimulatorError) as err:
+            failed.append(str(err) if str(source) in str(err) else f"{source}: {err}")
+
+
 def say(out: Path, rows: Sequence[TrajectoryRow], refused: int = 0) -> None:
     """Prints what was written, and every reason against an exact replay."""
     exact = sum(not row.not_replayable for row in rows)

@@ -21,6 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX, Frame, features_of
+from lerobot_roborecover.datasets.lerobot_folder import check_lerobot_folder, local_repo_id
 from lerobot_roborecover.datasets.video_frames import REMEDY, check_frames
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -91,14 +92,13 @@ class Episode:
     """Columns of its own, (T,) each: bool, or numbers that are written as float32."""
 
 
-def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int], name: str) -> None:
+def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int]) -> None:
     """Joins LeRobotDatasets into a new one without encoding anything again, and counts its frames.
 
     Args:
         root: the new dataset's folder.
         sources: in the order in which their episodes follow each other.
         steps: of all episodes, in that order.
-        name: of the new dataset.
 
     Raises:
         ScenarioError: they do not fit together, or an episode's film has another number of frames than steps.
@@ -106,10 +106,14 @@ def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int], nam
     from lerobot.datasets.aggregate import aggregate_datasets
 
     quiet_video()
+    for source in sources:
+        if not check_lerobot_folder(source).tasks_in_order:
+            # LeRobot would take the instruction of another row.
+            raise ScenarioError(
+                f"{source}/meta/tasks.parquet is not in order of task_index; write its rows in that order"
+            )
     try:
-        aggregate_datasets(
-            [f"roborecover/{s.name}" for s in sources], f"roborecover/{name}", list(sources), root
-        )
+        aggregate_datasets([local_repo_id(s) for s in sources], local_repo_id(root), list(sources), root)
     except ValueError as err:
         raise ScenarioError(f"the datasets cannot be joined: {err}") from err
     check_frames(root, steps, thorough=True)
@@ -146,7 +150,7 @@ class EpisodeWriter:
 
         Raises:
             ScenarioError: it has not one frame before each action, or a camera's film another number of
-                frames than that.
+                frames than that; or its columns are not those of the first episode.
         """
         dataset, steps, written = self._dataset, len(episode.actions), 0
         for frame in episode.frames:
@@ -157,16 +161,24 @@ class EpisodeWriter:
                 dataset = self._dataset = self._create(episode, frame)
             action = episode.actions[written]
             own = {k: np.array([v[written]], dtype=_dtype(v)) for k, v in episode.columns.items()}
-            dataset.add_frame(
-                {
-                    **frame,
-                    "action": action.astype(np.float32),
-                    EXACT_ACTION: action,
-                    SCENARIO_INDEX: np.array([episode.scenario_index], dtype=np.int64),
-                    "task": episode.instruction,
-                    **own,
-                }
-            )
+            row = {
+                **frame,
+                "action": action.astype(np.float32),
+                EXACT_ACTION: action,
+                SCENARIO_INDEX: np.array([episode.scenario_index], dtype=np.int64),
+                "task": episode.instruction,
+                **own,
+            }
+            try:
+                dataset.add_frame(row)
+            except ScenarioError:
+                raise
+            except ValueError as err:
+                raise ScenarioError(
+                    f"{episode.name}, step {written}: its columns are not those of the first episode "
+                    f"({' '.join(str(err).split())[:300]}); write episodes with other cameras or shapes as a "
+                    "dataset of their own"
+                ) from err
             written += 1
         if dataset is None or written != steps or not written:
             raise ScenarioError(
@@ -183,7 +195,7 @@ class EpisodeWriter:
             k: {"dtype": _dtype(v), "shape": (1,), "names": None} for k, v in episode.columns.items()
         }
         dataset = LeRobotDataset.create(
-            repo_id=f"roborecover/{self._root.name.strip('.')}",
+            repo_id=local_repo_id(self._root),
             fps=self._fps,
             features=features,
             root=self._root,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -59,15 +59,7 @@ def read_array(
     """
     import h5py
 
-    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
-    node = group
-    for part in name.split("/"):
-        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
-        if isinstance(link, h5py.ExternalLink):
-            raise ScenarioError(f"{where} is a link to another file; only the file itself is read")
-        node = node.get(part) if link is not None else None
-        if node is None:
-            raise ScenarioError(f"{where} is missing")
+    where, node = _find(group, name)
     if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
         raise ScenarioError(f"{where} is not an array in the file itself")
     if node.nbytes > MAX_ARRAY_BYTES:
@@ -83,10 +75,50 @@ def read_array(
             f"{where} has {node.shape[0] if node.shape else 'no'} rows, but there are {rows[0]} {rows[1]}: "
             "which belongs to which is not known. Take the file from its source again"
         )
-    values = node[()]
+    try:
+        values = node[()]
+    except (OSError, RuntimeError, MemoryError) as err:
+        raise ScenarioError(
+            f"{where} cannot be read: {str(err)[:200]}. Take the file from its source again"
+        ) from None
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise ScenarioError(f"{where} holds NaN or infinity; record it again")
     return values
+
+
+def read_group(group: h5py.Group, name: str, why: str = "") -> h5py.Group:
+    """Returns a group below a group.
+
+    Args:
+        group: of an open file.
+        name: path below it.
+        why: what a file without it is, and the remedy.
+
+    Raises:
+        ScenarioError: it is missing, lies in another file, or is no group.
+    """
+    import h5py
+
+    where, node = _find(group, name, why)
+    if not isinstance(node, h5py.Group):
+        raise ScenarioError(f"{where} is not a group. Take the file from its source again")
+    return node
+
+
+def _find(group: h5py.Group, name: str, why: str = "") -> tuple[str, Any]:
+    """Returns where a node is, for messages, and the node itself."""
+    import h5py
+
+    where = f"{group.file.filename}: {group.name.rstrip('/')}/{name}"
+    node = group
+    for part in name.split("/"):
+        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+        if isinstance(link, h5py.ExternalLink):
+            raise ScenarioError(f"{where} is a link to another file; only the file itself is read")
+        node = node.get(part) if link is not None else None
+        if node is None:
+            raise ScenarioError(f"{where} is missing{why and f': {why}'}")
+    return where, node
 
 
 def episode_names(group: h5py.Group, prefix: str) -> list[str]:

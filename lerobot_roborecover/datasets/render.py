@@ -75,7 +75,7 @@ def render_dataset(
     with new_folder(root) as folder:
         if episodes:
             # In a process that has LeRobot already.
-            pool.call(_join, paths, [len(s.prefix) for s in scenarios], root.name.strip("."), folder)
+            pool.call(_join, paths, [len(s.prefix) for s in scenarios], folder)
         frames = (found for path in paths for found in FrameStore(path).values())
         write_scenarios(folder, scenarios, description=description, license=license, frames=frames)
     return root
@@ -119,11 +119,11 @@ def _render_shard(begin: int, scenarios: Sequence[Scenario], path: Path, episode
         write_scenarios(folder, scenarios, frames=last)
 
 
-def _join(paths: Sequence[Path], steps: Sequence[int], name: str, folder: Path) -> None:
+def _join(paths: Sequence[Path], steps: Sequence[int], folder: Path) -> None:
     """Joins the episodes of shards as one dataset; a single one, whose frames are counted, is copied."""
     if len(paths) == 1:
         shutil.copytree(paths[0], folder, ignore=shutil.ignore_patterns(Path(FOLDER).name))
         return
     from lerobot_roborecover.datasets.encoding import join_datasets
 
-    join_datasets(folder, paths, steps, name)
+    join_datasets(folder, paths, steps)

@@ -14,6 +14,7 @@ from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
 from lerobot_roborecover.rounding import policy_kernels
 from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
+from lerobot_roborecover.words import output_end
 from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 _POLL_S = 0.5
@@ -100,10 +101,9 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
     tally.add(tail.read())
     progress.show(tally, final=True)
     if process.returncode != 0 or tally.done < tally.total:
-        lines = output.read_text(errors="replace").splitlines()[-_SHOWN_LINES:]
-        shown = "\n".join(f"  {line}" for line in lines)
+        cause, shown = output_end(output.read_text(errors="replace"), _SHOWN_LINES)
         raise DemoError(
             f"lerobot-eval from {start} starts ended with status {process.returncode} after {tally.done} of "
-            f"{tally.total} trials. The end of {output}:\n{shown}\n"
+            f"{tally.total} trials: {cause or 'it said nothing'}\nThe end of {output}:\n{shown}\n"
             "Run the same command again to go on with what is left; 'roborecover doctor' checks this machine"
         )

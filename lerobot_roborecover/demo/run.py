@@ -13,7 +13,7 @@ from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo.evaluate import eval_command, evaluate
 from lerobot_roborecover.demo.page import write_page
-from lerobot_roborecover.demo.settings import DemoSettings, claim_folder
+from lerobot_roborecover.demo.settings import DemoSettings, hold_folder
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Scenario
@@ -37,12 +37,16 @@ def run_demo(settings: DemoSettings) -> Path:
     """
     found = load_scenarios(settings.scenarios, select=settings.select)
     scenarios = spread(tuple(found), settings.limit)
+    with hold_folder(settings):
+        return _run(settings, found.platform, scenarios)
+
+
+def _run(settings: DemoSettings, platform: str, scenarios: Sequence[Scenario]) -> Path:
     ids = [s.id for s in scenarios]
-    claim_folder(settings)
-    commands = [shlex.join(eval_command(settings, found.platform, ids, start)) for start in STARTS]
+    commands = [shlex.join(eval_command(settings, platform, ids, start)) for start in STARTS]
     _say(f"{len(ids)} scenarios, {settings.trials} trial(s) each, from recovery and from initial starts")
     for start in STARTS:
-        evaluate(settings, found.platform, ids, start)
+        evaluate(settings, platform, ids, start)
     tallies = [Tally(start, ids, settings.trials) for start in STARTS]
 
     def wanted(row: TrialRow) -> bool:

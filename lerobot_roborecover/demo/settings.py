@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.resources
 import json
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.env.identity import policy_identity
+from lerobot_roborecover.journal import InUseError, open_locked
 from lerobot_roborecover.whole import write_whole
 
 SCENARIOS = "metaworld_starter"
@@ -98,3 +101,24 @@ def claim_folder(settings: DemoSettings) -> None:
         raise DemoError(
             f"cannot use {settings.out} for the demo's output: {err}. Choose another with --out"
         ) from None
+
+
+@contextmanager
+def hold_folder(settings: DemoSettings) -> Generator[None]:
+    """Claims the output folder, and keeps other demos out of it until the block ends.
+
+    Raises:
+        DemoError: see `claim_folder`; or another demo is at work in the folder.
+    """
+    claim_folder(settings)
+    try:
+        lock = open_locked(settings.out / ".lock", "a")
+    except InUseError:
+        raise DemoError(
+            f"another demo is at work in {settings.out}. Wait for it, or give this one a folder of its own: "
+            "--out FOLDER"
+        ) from None
+    except OSError as err:
+        raise DemoError(f"cannot write to {settings.out}: {err}. Choose another with --out") from None
+    with lock:
+        yield

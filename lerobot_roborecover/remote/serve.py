@@ -16,13 +16,10 @@ from lerobot.utils.utils import init_logging
 from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
-<<<<<<< HEAD
 from lerobot_roborecover.env.policy_settings import digest_of
-=======
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.threads import fit_threads
->>>>>>> wt-err
 from lerobot_roborecover.remote.keys import API_KEY, api_key
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.server import PolicyServer, ServeOptions, is_loopback
@@ -127,17 +124,13 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
         "device_processor": {"device": str(config.device)},
         "rename_observations_processor": {"rename_map": rename_map},
     }
-<<<<<<< HEAD
-    pre, post = make_pre_post_processors(
-        config,
-        pretrained_path=path,
-        pretrained_revision=config.pretrained_revision,
-        preprocessor_overrides=overrides,
-    )
-=======
     with plain_loading(f"--policy.path={path}"):
-        pre, post = make_pre_post_processors(config, pretrained_path=path, preprocessor_overrides=overrides)
->>>>>>> wt-err
+        pre, post = make_pre_post_processors(
+            config,
+            pretrained_path=path,
+            pretrained_revision=config.pretrained_revision,
+            preprocessor_overrides=overrides,
+        )
     return ServedPolicy(policy, pre, post, rename_map, max_batch)
 
 

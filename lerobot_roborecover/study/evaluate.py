@@ -26,13 +26,10 @@ from lerobot_roborecover.study.outcomes import (
     outcomes_of,
     read_outcomes,
 )
-<<<<<<< HEAD
 from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
-from lerobot_roborecover.trials.sizes import usable_cores
-=======
 from lerobot_roborecover.trials.sizes import SLOT_GB
+from lerobot_roborecover.words import output_end
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
->>>>>>> wt-err
 
 DONE_FILE = "done.json"
 """Beside the log of an arm that has finished: the run that it was."""
@@ -147,9 +144,9 @@ def check_arms(waiting: Sequence[StudyArm], study: StudyDefinition, out: Path) -
     with log.open("wb") as stream:
         status = run_module("lerobot_roborecover.study.startable", runs, study.environment, stream)
     if status:
-        lines = log.read_text(errors="replace").splitlines()
-        told = [line for line in lines if line.startswith(CANNOT_START)]
-        shown = "\n".join(f"  {line}" for line in told or lines[-_SHOWN_LINES:])
+        output = log.read_text(errors="replace")
+        told = [f"  {line}" for line in output.splitlines() if line.startswith(CANNOT_START)]
+        shown = "\n".join(told) or output_end(output, _SHOWN_LINES)[1]
         raise ScenarioError(
             f"not every arm can start, and none was begun ({log} says more):\n{shown}\n"
             "Put right what is named, and run the same command again"
@@ -167,12 +164,10 @@ def run_arm(arm: StudyArm, study: StudyDefinition) -> None:
     with log.open("ab") as stream:
         status = run_module("lerobot_roborecover.cli.main", argv, study.environment, stream)
     if status:
-        shown = "\n".join(
-            f"  {line}" for line in log.read_text(errors="replace").splitlines()[-_SHOWN_LINES:]
-        )
+        cause, shown = output_end(log.read_text(errors="replace"), _SHOWN_LINES)
         raise ScenarioError(
-            f"`roborecover {shlex.join(argv)}` ended with status {status}. The end of {log}:\n"
-            f"{shown}\nRun the same command again to go on with what is left"
+            f"`roborecover {shlex.join(argv)}` ended with status {status}: {cause or 'it said nothing'}\n"
+            f"The end of {log}:\n{shown}\nRun the same command again to go on with what is left"
         )
 
 

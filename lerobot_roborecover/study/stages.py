@@ -10,6 +10,7 @@ import yaml
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig
 from lerobot_roborecover.curation.screen.screening import ScreenRule
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.datasets.load import builtin_names
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.recipe import StudyRecipe
@@ -141,7 +142,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
             "correction",
             (
                 (recipe.train, f"--config_path={recipe.correction}", f"--policy.path={policy(recipe.base)}",
-                 "--dataset.repo_id=local/donors", f"--dataset.root={out / 'donors'}",
+                 f"--dataset.repo_id={local_repo_id(out / 'donors')}", f"--dataset.root={out / 'donors'}",
                  f"--output_dir={correction}"),
                 _cli("export-ema", str(correction / CHECKPOINT.parent), "--out", str(out / "correction")),
             ),

@@ -35,6 +35,7 @@ from lerobot_roborecover.trials.progress import ProgressLine, Tally
 from lerobot_roborecover.trials.sequential import ALONE, open_watch
 from lerobot_roborecover.trials.units import OrderedQueue, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.workplace import Workplace
 
@@ -318,7 +319,7 @@ def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Seq
     out = cfg.folder
     out.mkdir(parents=True, exist_ok=True)
     info = eval_info(rows, cfg.recovery_env.group_by, videos)
-    (out / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
+    write_whole(out / "eval_info.json", json.dumps(info, indent=2) + "\n")
     print(format_table(summarise([asdict(r) for r in rows])))
     if lack := missing(rows):
         print(f"\nincomplete: {lack.words}")

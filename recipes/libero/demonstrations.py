@@ -32,6 +32,7 @@ from unittest.mock import patch
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.platforms.base import Driver
 from lerobot_roborecover.platforms.libero.expert import LiberoExpert
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
@@ -52,7 +53,6 @@ _GIVE_UP_AFTER = 3
 """Rollouts for each episode that is wanted."""
 CAMERAS = ("image", "image2")
 """LeRobot's names of the scene's and the wrist's camera."""
-_REPOSITORY = "roborecover/libero_demonstrations"
 _WIDTHS = {"observation.state": 8, "observation.environment_state": 77, "action": 7, "next.reward": 1}
 
 
@@ -283,7 +283,7 @@ def write_dataset(
     embed = dataset_writer.embed_images if pictures else lambda rows: rows
     with new_folder(root) as folder, patch.object(dataset_writer, "embed_images", embed):
         dataset = LeRobotDataset.create(
-            repo_id=_REPOSITORY,
+            repo_id=local_repo_id(root),
             root=folder,
             fps=int(PLATFORM.control_hz),
             robot_type="panda",
@@ -309,7 +309,7 @@ def _join(root: Path, parts: Sequence[Path]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
     with new_folder(root) as folder:
-        aggregate_datasets([_REPOSITORY] * len(parts), _REPOSITORY, list(parts), folder)
+        aggregate_datasets([local_repo_id(p) for p in parts], local_repo_id(root), list(parts), folder)
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.platforms.base import Driver
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.experts import expert
@@ -132,7 +133,7 @@ def create_dataset(root: Path) -> Any:
         return {"dtype": "float32", "shape": (size,), "names": None}
 
     return LeRobotDataset.create(
-        repo_id="roborecover/metaworld_demonstrations",
+        repo_id=local_repo_id(root),
         root=root,
         fps=80,
         robot_type="sawyer",

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.scenario import Reset
 
@@ -65,7 +66,7 @@ def write_demonstrations(root: Path, count: int) -> None:
 
     widths = {"observation.state": 2, "observation.environment_state": 16, "action": 2, "next.reward": 1}
     dataset = LeRobotDataset.create(
-        repo_id="roborecover/pusht_demonstrations",
+        repo_id=local_repo_id(root),
         root=root,
         fps=10,
         robot_type="pusht",

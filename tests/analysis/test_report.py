@@ -362,6 +362,8 @@ def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     assert main(["report", str(runs), f"--out={out}", *options]) == 0
     assert "push" in capsys.readouterr().out
     page = (out / "report.html").read_text()
+    policy = re.search('http-equiv="Content-Security-Policy" content="([^"]+)"', page)[1]
+    assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} <= set(policy.split("; "))
     assert page.count('<li class="card"') == 6
     assert page.count("data:video/mp4;base64,ZmlsbQ==") == 1
     other = fake_dataset(tmp_path / "other", 3)

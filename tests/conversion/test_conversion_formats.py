@@ -7,6 +7,7 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
@@ -14,6 +15,7 @@ from lerobot_roborecover.datasets.trajectories import read_exact, read_trajector
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.conversion_scripts import script
+from tests.support.lerobot_folders import STEPS, lerobot_folder, write_tasks
 
 h5py = pytest.importorskip("h5py", reason="no h5py: pip install 'lerobot_env_roborecover[hdf5]'")
 pytestmark = pytest.mark.lerobot
@@ -120,6 +122,47 @@ def test_a_bad_demonstration_is_named_and_the_rest_goes_on(tmp_path, capsys):
     assert "1 trajectories" in said.out
 
 
+def test_raw_demonstrations_are_named_and_the_good_file_beside_them_is_kept(tmp_path, capsys):
+    good, raw, other = (libero_file(tmp_path / f"{name}.hdf5") for name in ("good", "raw", "other"))
+    with h5py.File(raw, "a") as file:
+        del file["data/demo_0/obs"], file["data/demo_1/obs"]
+    with h5py.File(other, "a") as file:
+        del file["data"]
+    arguments = [str(raw), str(other), str(good), str(tmp_path / "none.hdf5")]
+    assert script("libero_hdf5").main([*arguments, "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if str(tmp_path) in line]
+    assert len(lines) == 4
+    assert all(f"{raw}: /data/demo_{i}/obs is missing: raw demonstrations" in lines[i] for i in (0, 1))
+    assert f"{other}: /data is missing: it is not a LIBERO or robomimic file" in lines[2]
+    assert f"{tmp_path / 'none.hdf5'} cannot be opened as HDF5" in lines[3]
+    assert "2 trajectories" in said.out
+    assert "4 refused" in said.out
+    assert {r.provenance["file"] for r in read_trajectories(tmp_path / "out").rows} == {"good.hdf5"}
+
+
+def test_observations_of_another_file_or_form_are_refused(tmp_path, capsys):
+    path, secret = (libero_file(tmp_path / f"{name}.hdf5", demos=3) for name in ("x", "secret"))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/obs"], file["data/demo_1/obs"]
+        file["data/demo_0/obs"] = h5py.ExternalLink(str(secret), "data/demo_0/obs")
+        file["data/demo_1/obs"] = np.zeros(3)
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "demo_0/obs is a link to another file" in said
+    assert "demo_1/obs is not a group" in said
+
+
+def test_demonstrations_with_other_cameras_are_refused_in_one_line(tmp_path, capsys):
+    path = libero_file(tmp_path / "x.hdf5")
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1/obs/eye_in_hand_rgb"]
+    assert script("libero_hdf5").main([str(path), "--out", str(tmp_path / "out")]) == 2
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.startswith("libero_hdf5: ")
+    assert "observation.images.image2" in line
+
+
 @pytest.mark.parametrize("text", [b"", b"\x80\x04pickle", b"\x89HDF\r\n\x1a\n"])
 def test_what_is_no_hdf5_is_refused_and_leaves_nothing(tmp_path, capsys, text):
     (tmp_path / "x.hdf5").write_bytes(text)
@@ -223,12 +266,22 @@ def test_a_licence_that_nobody_knows_is_refused_before_anything_is_read(tmp_path
 
 
 def test_robotwin_episodes_without_instruction_or_pictures_are_named(tmp_path, capsys):
-    folder = robotwin_folder(tmp_path, episodes=3)
+    folder = robotwin_folder(tmp_path, episodes=5)
     (folder / "instructions" / "episode0.json").write_text("{}")
+    (folder / "seed.txt").write_bytes(b"7 11 13 \xff\xfe 17")
+    with h5py.File(folder / "data" / "episode4.hdf5", "a") as file:
+        del file["observation"]
+    (folder / "data" / "episode_new.hdf5").touch()
     with h5py.File(folder / "data" / "episode1.hdf5", "a") as file:
         del file["observation/head_camera/rgb"]
-    assert script("robotwin_hdf5").main([str(folder), "--out", str(tmp_path / "out")]) == 1
+    empty = tmp_path / "stack_bowls_two" / "demo_clean"
+    empty.mkdir(parents=True)
+    assert script("robotwin_hdf5").main([str(empty), str(folder), "--out", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().err
+    assert f"{empty} has no data/episode*.hdf5" in said
+    assert "seed.txt: '\ufffd\ufffd' is not a whole number" in said
+    assert "/observation is missing" in said
+    assert "episode_new.hdf5: " in said
     assert "episode0.json, field unseen" in said
     assert "observation/head_camera/rgb is missing" in said
 
@@ -305,6 +358,40 @@ def test_a_dataset_without_no_ops_and_with_another_width_is_told_apart(recorded,
         convert([str(tmp_path), "--platform", "metaworld", *common[:2], "--out", str(tmp_path / "o2")]) == 2
     )
     assert "meta/info.json" in capsys.readouterr().err
+
+
+def convert_rollouts(root, out):
+    return script("lerobot_rollouts").main(
+        [str(root), "--platform", "metaworld", "--driver", "act", "--out", str(out)]
+    )
+
+
+def test_rollouts_are_of_the_task_of_their_index_wherever_its_row_is(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    names = ["button-press-v3", "door-open-v3", "drawer-close-v3"]
+    tasks = [task_by_name("metaworld", name).instruction for name in names]
+    root = lerobot_folder(tmp_path / "recording", tasks)
+    write_tasks(root, [tasks[i] for i in (2, 0, 1)], [2, 0, 1])
+    assert convert_rollouts(root, tmp_path / "out") == 0
+    assert [r.task["name"] for r in read_trajectories(tmp_path / "out").rows] == names
+    dataset = LeRobotDataset("lab/x", root=tmp_path / "out")
+    assert [dataset[i * STEPS]["task"] for i in range(3)] == tasks, "LeRobot counts the rows"
+
+
+@pytest.mark.parametrize("column", ["named so", "in the data alone"])
+def test_a_column_actions_is_refused_in_one_line(tmp_path, capsys, column):
+    root = lerobot_folder(tmp_path / "recording", ["open it"])
+    info, data = root / "meta" / "info.json", root / "data" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(data)
+    names = ["actions" if n == "action" else n for n in table.column_names]
+    pq.write_table(table.rename_columns(names), data)
+    if column == "named so":
+        info.write_text(info.read_text().replace('"action"', '"actions"'))
+    assert convert_rollouts(root, tmp_path / "out") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "actions" in said
+    assert "ename" in said or "Give them the same names" in said
 
 
 def test_tasks_are_found_by_name_and_by_instruction():

@@ -187,6 +187,38 @@ BAD_RECORDS = {
     ),
     "other label": (change(d_stage="Scene Change"), ["column d_stage", "'Scene Change'"]),
     "pickle": ({"text": lambda t: "\x80\x04."}, ["not usable JSON"]),
+    "episode": (change(episode_idx=77), ["field episode_idx: 77", "init states 0 to 49"]),
+    "no rotation": (
+        {"record": lambda r: r["initial_state"].update(quat=[0, 0, 0, 0])},
+        ["field initial_state", "quaternion has norm 0, not 1"],
+    ),
+    "contradiction": (
+        change(error_category="S:Place;D:Scene Change"),
+        ["field error_category: 'S:Place;D:Scene Change' contradicts s_stage 'Contact'"],
+    ),
+    "escape": (change(task_description="put \x1b[31m it"), ["field task_description", "control character"]),
+    "right to left": (change(model_name="pi05\u202e"), ["field model_name", "control character"]),
+    "escape in a note": (change(data_type=["a", {"b\x00": 1}]), ["field 'data_type'", "control character"]),
+    "deep": (
+        {
+            "record": lambda r: r.update(data_type=1),
+            "text": lambda t: t.replace('"data_type": 1', f'"data_type": {"[" * 900}{"]" * 900}'),
+        },
+        ["nested more than 64 deep"],
+    ),
+}
+BAD_ROBOTWIN = {
+    "success": (change(success="false"), ["field success: 'false' is not true, false or null"]),
+    "total": (
+        change(total_steps=12),
+        ["field total_steps: 12, before the recovery point", "annotated_step = 20"],
+    ),
+    "no rotation": (
+        {"record": lambda r: r["initial_state"].update(left_endpose=[0.0] * 7)},
+        ["field initial_state", "a rotation in left_endpose: its quaternion has norm 0, not 1"],
+    ),
+    "contradiction": (change(error_type="S:Move;D:Wrong Pose"), ["field error_type", "contradicts s_stage"]),
+    "escape": (change(instruction="Put it.\n"), ["field instruction", "control character"]),
 }
 
 
@@ -202,6 +234,33 @@ def test_a_bad_record_is_named_by_file_and_field_and_the_rest_goes_on(release, t
     assert "libero_train_0001" not in found
     report = json.loads((tmp_path / "out" / "libero" / FOLDER / "conversion.json").read_text())
     assert [r["sample_id"] for r in report["refused"]] == ["libero_train_0001"]
+
+
+@pytest.mark.parametrize("case", BAD_ROBOTWIN)
+def test_a_bad_robotwin_record_is_named_by_field_without_a_replay(release, case):
+    how, words = BAD_ROBOTWIN[case]
+    edit(release, "robotwin", "train", 1, **how)
+    result = read_release(release, "robotwin")
+    assert len(result.scenarios) == 4
+    (failure,) = map(str, result.failures)
+    assert all(word in failure for word in ["robotwin/train/robotwin_train_0001.json", *words]), failure
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-32", "latin-1"])
+def test_a_record_in_another_encoding_is_refused_and_the_rest_goes_on(release, tmp_path, capsys, encoding):
+    path = release / "robotwin/train/robotwin_train_0001.json"
+    path.write_bytes(json.dumps(json.loads(path.read_text()), ensure_ascii=False).encode(encoding))
+    edit(release, "robotwin", "train", 1, cells={"sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
+    assert convert([str(release), "--out", str(tmp_path / "out")]) == 1
+    assert "robotwin_train_0001.json: not usable JSON" in capsys.readouterr().err
+    assert len(load_scenarios(tmp_path / "out" / "robotwin")) == 4
+
+
+def test_notes_of_several_lines_are_kept(release, tmp_path):
+    edit(release, "robotwin", "train", 1, record=lambda r: r["annotation_meta"].update(note="one\n\ttwo"))
+    scenarios = read_release(release, "robotwin").scenarios
+    assert len(scenarios) == 5
+    assert scenarios[1].provenance["release"]["record"]["annotation_meta"]["note"] == "one\n\ttwo"
 
 
 BAD_ROWS = {

@@ -29,6 +29,7 @@ from lerobot_roborecover.curation.training.lines import (
     without_test,
 )
 from lerobot_roborecover.curation.training.returns import returns_to_go, values
+from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.env.trial import actions_digest
@@ -233,7 +234,7 @@ def test_lerobot_trains_on_it(log, tmp_path, monkeypatch, capsys):
         asked.clear()
         lerobot_train(
             f"--policy.path={base}", "--policy.device=cpu", "--policy.push_to_hub=false",
-            "--dataset.repo_id=local/training", f"--dataset.root={out}",
+            f"--dataset.repo_id={local_repo_id(out)}", f"--dataset.root={out}",
             f"--output_dir={tmp_path / name}", "--steps=2", "--batch_size=4", "--num_workers=0",
             "--save_freq=2", *options,
         )  # fmt: skip

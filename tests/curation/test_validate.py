@@ -287,6 +287,7 @@ def test_what_was_tampered_with_is_caught(validated):
     assert all(hand_off(make_simulator("fake"), s).identical for s in kept)
     assert count_stages(read_decisions(root / "out"))[-1].kept == 3
     page = (root / "out.replays" / "index.html").read_text()
+    assert "base-uri 'none'; form-action 'none'" in page
     order = re.findall(r'<article id="([^"]+)"', page)
     assert len(order) == 9
     assert set(order[-3:]) == {s.id for s in kept}, "the worst first"

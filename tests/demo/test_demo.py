@@ -22,7 +22,7 @@ from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.evaluate import eval_command
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.run import run_demo, spread
-from lerobot_roborecover.demo.settings import DemoSettings, claim_folder
+from lerobot_roborecover.demo.settings import DemoSettings, claim_folder, hold_folder
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.env.trial_row import Protocol, make_row
 from lerobot_roborecover.rounding import policy_kernels
@@ -66,6 +66,9 @@ for index, scenario in enumerate(load_scenarios(given["env.scenarios"], select=g
             continue
         if written == fail_after:
             print("RuntimeError: the stand-in gives up")
+            for done in range(40):
+                print(f"Stepping: {done:3}%|#   | {done}/100 [00:01<00:09, 9.9it/s]", end="\\r")
+                print(f"\\nRunning rollout: {done}it [00:01, 9.9it/s]")
             sys.exit(3)
         log.append(row)
         written += 1
@@ -169,9 +172,11 @@ def test_a_finished_demo_runs_nothing_again(settings):
 @pytest.mark.slow
 def test_a_failed_run_shows_the_end_of_its_output_and_goes_on_when_rerun(settings, capsys):
     with pytest.raises(
-        DemoError, match=r"(?s)status 3 after 3 of 8 trials.*the stand-in gives up.*same command"
-    ):
+        DemoError,
+        match=r"(?s)status 3 after 3 of 8 trials: RuntimeError: the stand-in gives up\n.*same command",
+    ) as failed:
         run_demo(settings(fail_after=3))
+    assert "it/s" not in str(failed.value)
     assert len(read_trial_log(settings().trial_log)) == 3
     run_demo(settings())
     assert len(read_trial_log(settings().trial_log)) == 16
@@ -227,6 +232,15 @@ def test_a_folder_of_another_policy_is_refused(settings, tmp_path):
     (tmp_path / "out" / "demo.json").write_text("[]")
     with pytest.raises(DemoError, match="--out"):
         claim_folder(settings())
+
+
+def test_two_demos_in_one_folder_are_kept_apart(settings, tmp_path):
+    with hold_folder(settings()):
+        with pytest.raises(DemoError, match=r"another demo is at work in .*out\. Wait for it.*--out FOLDER"):
+            run_demo(settings())
+        assert not (tmp_path / "out" / "recovery").exists()
+    with hold_folder(settings()):
+        pass
 
 
 def test_bad_input_ends_with_one_line_and_status_2(settings, tmp_path, capsys, dataset):

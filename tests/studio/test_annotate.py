@@ -187,7 +187,9 @@ def test_a_person_without_a_token_reads_what_to_do(quiet, path):
     answer = ann.get(url, headers={"Accept": "text/html,*/*;q=0.8", "Cookie": ""})
     assert answer.status_code in (403, 404)
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
-    assert "style-src 'sha256-" in answer.headers["content-security-policy"]
+    policy = answer.headers["content-security-policy"]
+    assert "style-src 'sha256-" in policy
+    assert "form-action 'none'" in policy
     assert "?token=" in answer.text
     assert "bob" not in answer.text
     other = ann.get(url, headers={"Accept": "text/html", "Host": "<b>.example"})
@@ -218,7 +220,7 @@ def test_packs_hold_the_very_frames(quiet, episode, camera):
     assert [number_of(f) for pack in packs for f in pack] == [(n, episode % 3) for n in range(STEPS)]
 
 
-@pytest.mark.parametrize("number", [2, 10**9, -1])
+@pytest.mark.parametrize("number", [2, 10**9, -1, "9" * 5000, "\u0662", "1e0"])
 def test_a_frame_out_of_range_is_refused(quiet, number):
     ann = quiet[0]["ann"]
     answer = ann.get(f"api/episodes/{ann.episode('ep-0000')}/frames/{CAMERAS[0]}/{number}")

@@ -66,8 +66,8 @@ def robotwin_record(index: int, steps: int = 20, ee: bool = False) -> dict:
         "annotated_step": steps,
         "initial_state": {
             "joint_vector": rng.uniform(-1, 1, 14).tolist(),
-            "left_endpose": rng.uniform(-1, 1, 7).tolist(),
-            "right_endpose": rng.uniform(-1, 1, 7).tolist(),
+            "left_endpose": end_pose(rng),
+            "right_endpose": end_pose(rng),
             "left_gripper": 1.0,
             "right_gripper": 1,
         },
@@ -88,6 +88,13 @@ def robotwin_record(index: int, steps: int = 20, ee: bool = False) -> dict:
     if ee:
         record["action_type"] = "ee"
     return record
+
+
+def end_pose(rng: np.random.Generator) -> list[float]:
+    """Position and quaternion."""
+    pose = rng.uniform(-1, 1, 7)
+    pose[3:] /= np.linalg.norm(pose[3:])
+    return pose.tolist()
 
 
 def task_name(platform: str, record: dict) -> str:

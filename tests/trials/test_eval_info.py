@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+from types import SimpleNamespace
 
 import pytest
 
@@ -33,6 +36,30 @@ def test_trials_of_one_scenario_are_no_further_scenarios():
     assert high - low > 60
     low, high = success_counts([[1.0, 0.0] * 50])["pc_success_ci95"]
     assert high - low < 25
+
+
+@pytest.mark.lerobot
+def test_the_file_is_replaced_by_a_whole_one_or_not_at_all(tmp_path, monkeypatch, capsys):
+    from lerobot_roborecover.trials import runner
+
+    def full(number):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    cfg = SimpleNamespace(
+        folder=tmp_path, eval=SimpleNamespace(n_episodes=1), recovery_env=SimpleNamespace(group_by="suite")
+    )
+    run = SimpleNamespace(
+        rows=lambda: [trial_row(0, 0, True)], kept_log=lambda: SimpleNamespace(path=tmp_path / "trials.jsonl")
+    )
+    scenarios = [SimpleNamespace(id=trial_row(0, 0, True).scenario_id)]
+    (tmp_path / "eval_info.json").write_text("earlier")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            runner.report(cfg, run, scenarios, [])
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("eval_info.json", "earlier")]
+    runner.report(cfg, run, scenarios, [])
+    assert json.loads((tmp_path / "eval_info.json").read_text())["overall"]["n_success"] == 1
 
 
 def test_too_little_to_say_anything():

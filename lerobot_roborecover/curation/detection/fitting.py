@@ -16,6 +16,7 @@ import torch
 from lerobot_roborecover.curation.detection.forked import SeenForks
 from lerobot_roborecover.curation.detection.scoring import PolicyLooks
 from lerobot_roborecover.curation.detection.trials import SeenTrial
+from lerobot_roborecover.datasets.lerobot_folder import check_lerobot_folder, open_lerobot_folder
 from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds
 from lerobot_roborecover.interventions.detectors.modeling_policy import (
     RoboRecoverPolicyFeaturesRewardModel,
@@ -25,6 +26,7 @@ from lerobot_roborecover.interventions.detectors.modeling_states import (
     RoboRecoverStateDistanceRewardModel,
 )
 from lerobot_roborecover.interventions.monitor.errors import MonitorError
+from lerobot_roborecover.scenario import ScenarioError
 
 
 def fit_states(
@@ -74,6 +76,10 @@ def check_training_data(root: Path) -> None:
             f"--training-data {root}: no LeRobotDataset there (it has no meta/info.json). Give the folder of "
             "one, downloaded from the Hub or recorded"
         )
+    try:
+        check_lerobot_folder(root)
+    except ScenarioError as err:
+        raise MonitorError(f"--training-data: {err}") from None
 
 
 def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Tensor], list[str]]:
@@ -86,10 +92,8 @@ def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Te
     Raises:
         MonitorError: it lacks one.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     check_training_data(root)
-    dataset: Any = LeRobotDataset(f"local/{root.resolve().name}", root=root)
+    dataset: Any = open_lerobot_folder(root)
     missing = [k for k in keys if k not in dataset.features]
     if missing:
         raise MonitorError(
@@ -99,7 +103,7 @@ def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Te
         )
     table = dataset.hf_dataset.with_format("numpy")
     states = {k: torch.from_numpy(np.stack(table[k][:]).astype(np.float32)) for k in keys}
-    names = {int(row["task_index"]): str(text) for text, row in dataset.meta.tasks.iterrows()}
+    names = list(dataset.meta.tasks.index)
     return states, [names[int(i)] for i in np.asarray(table["task_index"][:]).reshape(-1)]
 
 

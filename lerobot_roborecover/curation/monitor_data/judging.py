@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.monitor import MonitorFrames
 from lerobot_roborecover.curation.monitor_data.data import STEP, check_disjoint
+from lerobot_roborecover.datasets.lerobot_folder import open_lerobot_folder
 from lerobot_roborecover.datasets.trajectories import LABEL, ScenarioLink, TrajectorySet, read_trajectories
 from lerobot_roborecover.interventions.monitor.base import TASK, choose_features
 from lerobot_roborecover.scenario import ScenarioError
@@ -47,7 +48,6 @@ def judge_dataset(
         MonitorError: it lacks what the monitor reads.
     """
     import torch
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     found = read_trajectories(root)
     if found.kind != "monitor":
@@ -56,7 +56,7 @@ def judge_dataset(
         )
     if not on_training_scenarios:
         check_held_out(monitor, found)
-    dataset = LeRobotDataset(f"roborecover/{root.resolve().name}", root=root)
+    dataset = open_lerobot_folder(root)
     choose_features(monitor.config, dataset.features)
     loader = torch.utils.data.DataLoader(
         dataset, batch_size=min(monitor.max_batch, 256), num_workers=num_workers

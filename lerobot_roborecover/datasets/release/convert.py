@@ -10,13 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from lerobot_roborecover.datasets.release.fields import LiftedByOption, check_labels
 from lerobot_roborecover.datasets.release.json_form import KEY
-from lerobot_roborecover.datasets.release.record import (
-    RULES,
-    LiftedByOption,
-    Reading,
-    to_scenario,
-)
+from lerobot_roborecover.datasets.release.record import RULES, Reading, to_scenario
 from lerobot_roborecover.datasets.release.tables import (
     MAX_RECORD_BYTES,
     PLATFORMS,
@@ -173,6 +169,10 @@ def read_record(
     except ScenarioError as err:
         raise ScenarioError(f"{err}. {remedy}") from None
     _check_against_row(scenario, row)
+    try:
+        check_labels(scenario.provenance[KEY]["record"])
+    except ScenarioError as err:
+        raise ScenarioError(f"{err}. {remedy}") from None
     note = {
         **scenario.provenance[KEY],
         "split_row": row.cells,

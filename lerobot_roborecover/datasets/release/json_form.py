@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
+MAX_DEPTH = 64
 KEY = "release"
 """Where a scenario's provenance holds what `to_json` and the export need."""
 
@@ -21,7 +22,7 @@ def parse_json(data: bytes) -> dict[str, Any]:
     """The fields of a record.
 
     Raises:
-        ScenarioError: it is no JSON object of finite numbers, Unicode text and unique names.
+        ScenarioError: it is no JSON object in UTF-8 of finite numbers, Unicode text and unique names.
     """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -43,9 +44,13 @@ def parse_json(data: bytes) -> dict[str, Any]:
         return number
 
     try:
-        record = json.loads(data, parse_constant=refuse, parse_float=finite, object_pairs_hook=unique)
+        # Decoded here: JSON's reader takes UTF-16 and UTF-32, too, which no record of the release is in.
+        text = data.decode("utf-8-sig")
+        record = json.loads(text, parse_constant=refuse, parse_float=finite, object_pairs_hook=unique)
         # Half of an escaped surrogate pair is no text, though JSON's reader takes it.
         json.dumps(record, ensure_ascii=False, allow_nan=False).encode()
+    except UnicodeDecodeError as err:
+        raise ScenarioError(f"not usable JSON: not in UTF-8 ({err.reason} at byte {err.start})") from None
     except (ValueError, RecursionError) as err:
         ends = isinstance(err, json.JSONDecodeError) and (
             err.pos >= len(err.doc.rstrip()) or err.msg.startswith("Unterminated")
@@ -55,6 +60,29 @@ def parse_json(data: bytes) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise ScenarioError(f"a JSON {type(record).__name__}, not an object with a record's fields")
     return record
+
+
+def texts_of(value: object) -> list[str]:
+    """Returns the texts in a JSON value, names of fields among them.
+
+    Raises:
+        ScenarioError: the value is nested deeper than `MAX_DEPTH`.
+    """
+    found: list[str] = []
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        if not level:
+            return found
+        inner: list[object] = []
+        for item in level:
+            if isinstance(item, str):
+                found.append(item)
+            elif isinstance(item, dict):
+                inner += [*item, *item.values()]
+            elif isinstance(item, list):
+                inner += item
+        level = inner
+    raise ScenarioError(f"JSON nested more than {MAX_DEPTH} deep; a record has a few levels")
 
 
 def to_json(scenario: Scenario) -> bytes:

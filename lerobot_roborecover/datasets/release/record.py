@@ -6,35 +6,31 @@ to the provenance, so that `to_json` gives the file back byte for byte.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.datasets.release.fields import LiftedByOption, check_fields
 from lerobot_roborecover.datasets.release.json_form import KEY, form_of, parse_json
 from lerobot_roborecover.datasets.release.sources import Sources
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_instruction, libero_tasks
+from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.platforms.libero.settle import leading_no_ops
 from lerobot_roborecover.platforms.robotwin.limits import ACTION_DIMS, STEP_LIMITS
 from lerobot_roborecover.scenario import (
     MAX_ACTION_MAGNITUDE,
     MAX_PREFIX_STEPS,
-    DeviationType,
     Reset,
     Scenario,
     ScenarioError,
-    Stage,
     Task,
 )
 
 LIBERO_SEED = 7
 """The release resets every LIBERO scenario with `env.seed(7)`."""
-
-
-class LiftedByOption(ScenarioError):
-    """A record is refused as long as nobody asks for it by the option that the message names."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +110,7 @@ def to_scenario(
             the file is from, which its reader knows.
     """
     record = parse_json(data)
-    _check_fields(platform, record, reading.keep_extra)
+    check_fields(platform, record, reading.keep_extra)
     if platform == "libero":
         check_seed(record["seed"], reading)
     actions, integers = _actions(record["actions"])
@@ -147,99 +143,6 @@ def to_scenario(
         cluster=cluster,
         provenance={KEY: note},
     )
-
-
-def _integer(value: object) -> str:
-    return "" if type(value) is int and 0 <= value < 2**32 else "an integer from 0 to 2^32 - 1"
-
-
-def _text(value: object) -> str:
-    return "" if isinstance(value, str) and 0 < len(value) <= 2000 else "text of 1 to 2000 characters"
-
-
-def _one_of(labels: type[StrEnum]) -> Callable[[object], str]:
-    wanted = f"one of {', '.join(labels)}"
-    return lambda value: "" if value in tuple(labels) else wanted
-
-
-def _anything(value: object) -> str:
-    return ""
-
-
-def _object(value: object) -> str:
-    return "" if isinstance(value, dict) else "an object"
-
-
-def _state(**widths: int) -> Callable[[object], str]:
-    def check(value: object) -> str:
-        said = "an object of " + ", ".join(f"{k}[{n}]" if n else k for k, n in widths.items())
-        if not isinstance(value, dict) or set(value) != set(widths):
-            return said
-        for name, width in widths.items():
-            numbers = value[name] if width else [value[name]]
-            if not isinstance(numbers, list) or len(numbers) != (width or 1):
-                return said
-            if not all(type(n) in (int, float) and abs(n) < 1e6 for n in numbers):
-                return said + " of finite numbers"
-        return ""
-
-    return check
-
-
-_COMMON: dict[str, Callable[[object], str]] = {
-    "task_description": _text,
-    "episode_idx": _integer,
-    "seed": _integer,
-    "task_suite_name": _text,
-    "data_type": _anything,
-    "model_name": _anything,
-    "s_stage": _one_of(Stage),
-    "d_stage": _one_of(DeviationType),
-    "annotated_step": _integer,
-    "actions": _anything,
-}
-_FIELDS: dict[str, dict[str, Callable[[object], str]]] = {
-    "libero": {
-        **_COMMON,
-        "model_name": _text,
-        "task_id": _integer,
-        "error_category": _anything,
-        "target_error_category": _anything,
-        "initial_state": _state(gripper=0, quat=4, rpy=3, xyz=3),
-    },
-    "robotwin": {
-        **_COMMON,
-        "task_name": _text,
-        "task_config": _text,
-        "instruction": _text,
-        "instruction_type": _text,
-        "policy_name": _text,
-        "success": _anything,
-        "total_steps": _integer,
-        "initial_state": _state(
-            joint_vector=14, left_endpose=7, right_endpose=7, left_gripper=0, right_gripper=0
-        ),
-        "error_type": _anything,
-        "annotation_meta": _object,
-    },
-}
-_OPTIONAL = {"libero": frozenset(), "robotwin": frozenset({"action_type", "video_paths"})}
-
-
-def _check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) -> None:
-    fields = _FIELDS[platform]
-    missing = [name for name in fields if name not in record]
-    if missing:
-        raise ScenarioError(f"field {missing[0]}: missing; a {platform} record has {', '.join(fields)}")
-    extra = [name for name in record if name not in fields and name not in _OPTIONAL[platform]]
-    if extra and not keep_extra:
-        raise LiftedByOption(
-            f"field {extra[0]!r:.80}: not of the {platform} release format; convert with --keep-extra to "
-            "keep such fields in the provenance"
-        )
-    for name, check in fields.items():
-        if wanted := check(record[name]):
-            raise ScenarioError(f"field {name}: {record[name]!r:.80} is not {wanted}")
 
 
 def _actions(value: object) -> tuple[np.ndarray, str]:
@@ -295,6 +198,12 @@ def _libero(record: Mapping[str, Any], prefix: np.ndarray) -> tuple[Task, Reset,
         raise ScenarioError(f"field task_id: {number}; {suite} has tasks 0 to {len(suites[suite]) - 1}")
     _check_width(prefix, (7,), "a LIBERO action")
     name = suites[suite][number]
+    states = _init_states(suite, name)
+    if record["episode_idx"] >= states:
+        raise ScenarioError(
+            f"field episode_idx: {record['episode_idx']}; task {number} of {suite} has init states 0 to "
+            f"{states - 1}"
+        )
     # The paper's evaluators prompt with LIBERO's `task.language`; `task_description` often has other words.
     return (
         Task("libero", suite, name, libero_instruction(name), LIBERO_HORIZONS[suite]),
@@ -306,6 +215,12 @@ def _libero(record: Mapping[str, Any], prefix: np.ndarray) -> tuple[Task, Reset,
         record["model_name"],
         f"{record['model_name']}:{suite}/{number}:{record['seed']}:{record['episode_idx']}",
     )
+
+
+@cache
+def _init_states(suite: str, name: str) -> int:
+    """Returns how many init states LIBERO stores for a task."""
+    return len(read_init_states(suite, name))
 
 
 def _robotwin(record: Mapping[str, Any], prefix: np.ndarray) -> tuple[Task, Reset, str, str]:

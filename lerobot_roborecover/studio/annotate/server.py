@@ -11,6 +11,7 @@ and the same stack carries the live streams of `teleop`.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -168,10 +169,11 @@ class Handlers:
         camera = request.path_params["camera"]
         if camera not in self.study.frames.videos.cameras:
             raise Refusal(404, f"there is no camera {camera[:80]!r}")
+        pack = request.path_params["pack"]
+        if not re.fullmatch("[0-9]{1,9}", pack):
+            raise Refusal(404, f"there is no pack {pack[:80]!r}; packs are numbered from 0")
         try:
-            data = await run_in_threadpool(
-                self.study.frames.pack, camera, number, request.path_params["pack"]
-            )
+            data = await run_in_threadpool(self.study.frames.pack, camera, number, int(pack))
         except IndexError as err:
             raise Refusal(416, str(err)) from None
         return Response(data, media_type="application/octet-stream")
@@ -263,7 +265,7 @@ def make_app(study: AnnotationStudy) -> Starlette:
         Route("/{annotator}/{file}", handlers.page),
         Route("/{annotator}/api/session", handlers.session),
         Route("/{annotator}/api/episodes/{episode}", handlers.episode_info),
-        Route("/{annotator}/api/episodes/{episode}/frames/{camera}/{pack:int}", handlers.frames),
+        Route("/{annotator}/api/episodes/{episode}/frames/{camera}/{pack}", handlers.frames),
         Route("/{annotator}/api/examples", handlers.examples),
         Route("/{annotator}/api/examples/{cell}", handlers.example),
         Route("/{annotator}/api/votes", handlers.vote, methods=["POST"]),

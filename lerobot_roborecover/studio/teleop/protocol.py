@@ -94,4 +94,5 @@ def read_picture(data: bytes) -> tuple[int, int, bytes]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    # `isfinite` fails on an integer that no float holds.
+    return type(value) is int or (isinstance(value, float) and math.isfinite(value))
