@@ -78,7 +78,7 @@ def _episode_frame(root: Path, row: int) -> np.ndarray | None:
     """The last frame of an episode, from its first camera's video."""
     import json
 
-    import pyarrow.parquet as pq
+    from lerobot_roborecover.datasets.parquet_read import episodes_of
 
     info = root / "meta" / "info.json"
     if not info.is_file():
@@ -89,14 +89,10 @@ def _episode_frame(root: Path, row: int) -> np.ndarray | None:
         return None
     key = cameras[0]
     names = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "to_timestamp")]
-    for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
-        table = pq.read_table(path, columns=["episode_index", *names]).to_pylist()
-        for episode in table:
-            if episode["episode_index"] == row:
-                chunk, file, end = (episode[name] for name in names)
-                return _frame_before(
-                    root / "videos" / key / f"chunk-{chunk:03d}" / f"file-{file:03d}.mp4", end
-                )
+    for _, table in episodes_of(root, ["episode_index", *names]):
+        for at in (table["episode_index"] == row).nonzero()[0]:
+            chunk, file, end = (table[name][at].item() for name in names)
+            return _frame_before(root / "videos" / key / f"chunk-{chunk:03d}" / f"file-{file:03d}.mp4", end)
     return None
 
 

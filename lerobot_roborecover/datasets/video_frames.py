@@ -16,10 +16,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.parquet_read import episodes_of
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_INFO_BYTES = 2**24
@@ -109,10 +108,9 @@ def read_clips(root: Path, cameras: Sequence[str]) -> list[Clip]:
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [f"videos/{camera}/{part}" for camera in cameras for part in parts]
     clips = []
-    for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
+    for path, table in episodes_of(root, ["episode_index", "length", *columns]):
         try:
-            table = pq.read_table(path, columns=["episode_index", "length", *columns]).to_pydict()
-            for row, episode in enumerate(table["episode_index"]):
+            for row, episode in enumerate(table["episode_index"].tolist()):
                 for camera in cameras:
                     chunk, file, start, end = (table[f"videos/{camera}/{part}"][row] for part in parts)
                     name = f"chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
@@ -121,7 +119,7 @@ def read_clips(root: Path, cameras: Sequence[str]) -> list[Clip]:
                     if not (0 <= float(start) <= float(end) < MAX_FILM_S and steps >= 0):
                         raise ValueError(f"episode {episode}: from {start} to {end} s, {steps} steps")
                     clips.append(Clip(int(episode), camera, video, float(start), float(end), steps))
-        except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as err:
+        except (OverflowError, ValueError) as err:
             raise ScenarioError(f"{path} is not LeRobot's ({err!s:.200}); fetch it again") from None
     return clips
 
