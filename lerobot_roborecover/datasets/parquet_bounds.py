@@ -81,25 +81,36 @@ def check_bounds(
     return schema
 
 
-def check_decoded_size(path: Path, data: Any) -> None:
+def check_decoded_size(path: Path, data: Any) -> int:
     """Checks how large any parquet file is once it is decoded, all of its columns together.
 
     Args:
         path: for messages only.
         data: the whole file, as bytes or a memory map.
 
+    Returns:
+        The number of values in the file.
+
     Raises:
         ScenarioError: the file is malformed, or decodes to more than `MAX_EXPANSION` times its size.
     """
     chunks = _chunks(path, data)
     _add_up(path, data, chunks, MAX_EXPANSION, plain=False)
-    try:
-        file = pq.ParquetFile(pa.BufferReader(data))
-    except (pa.ArrowException, OSError, ValueError) as err:
-        raise ScenarioError(f"{path} cannot be read as parquet: {err!s:.200}") from None
-    limit = SLACK_BYTES + MAX_EXPANSION * len(data)
-    # A list of a fixed size takes that size also where it is null and no value of it is in the file.
-    rows, values = file.metadata.num_rows, sum(chunk.values for chunk in chunks)
+    return sum(chunk.values for chunk in chunks)
+
+
+def check_fixed_lists(path: Path, file: pq.ParquetFile, values: int) -> None:
+    """Checks lists of a fixed size, which take that size also where they are null and hold no value.
+
+    Args:
+        path: for the size and messages.
+        file: opened.
+        values: of `check_decoded_size`.
+
+    Raises:
+        ScenarioError: they decode to more than `MAX_EXPANSION` times the file's size.
+    """
+    rows, limit = file.metadata.num_rows, SLACK_BYTES + MAX_EXPANSION * path.stat().st_size
     decoded = sum(_fixed_bytes(field.type, rows, values) for field in file.schema_arrow)
     if decoded > limit:
         raise ScenarioError(_too_much(f"{path}: lists of a fixed size", decoded, "bytes decoded", limit))

@@ -134,6 +134,8 @@ def _chunk(leaf: dict[int, Any], column: dict[int, Any], rows: int, size: int) -
     start = column[_DATA_PAGE_AT]
     dictionary = column.get(_DICTIONARY_PAGE_AT, 0)
     start = dictionary if 0 < dictionary < start else start
+    # Without a value nothing is read, and the positions of a chunk are those of no page.
+    length = column[_CHUNK_BYTES] if column[_CHUNK_VALUES] else 0
     chunk = Chunk(
         ".".join(name.decode() for name in column[_PATH]),
         leaf[_ELEMENT_TYPE],
@@ -142,9 +144,9 @@ def _chunk(leaf: dict[int, Any], column: dict[int, Any], rows: int, size: int) -
         rows,
         column[_CHUNK_VALUES],
         start,
-        start + column[_CHUNK_BYTES],
+        start + length,
     )
-    if not _whole(chunk.width, rows, chunk.values, start, column[_CHUNK_BYTES], chunk.kind):
+    if not _whole(chunk.width, rows, chunk.values, start, length, chunk.kind):
         raise TypeError("not a size")
     if chunk.end > size:
         raise PagesError(

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.parquet_bounds import check_decoded_size
+from lerobot_roborecover.datasets.parquet_bounds import check_decoded_size, check_fixed_lists
 from lerobot_roborecover.scenario import ScenarioError
 
 
@@ -37,8 +37,9 @@ def open_parquet(path: Path) -> Generator[pq.ParquetFile]:
             if not path.stat().st_size:
                 raise ScenarioError(f"{path} is empty; fetch or write the dataset again")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                check_decoded_size(path, data)
+                values = check_decoded_size(path, data)
         with pq.ParquetFile(path) as opened:
+            check_fixed_lists(path, opened, values)
             yield opened
     except (OSError, ValueError, IndexError, OverflowError, pa.ArrowException) as err:
         if isinstance(err, ScenarioError):
