@@ -13,6 +13,8 @@ from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.remote.sessions import PROTOCOL, RequestError
 
 _LONGEST_SIDE = 8192
+_MOST_NUMBERS = 3 * 2048 * 2048
+"""Of one array: each becomes a float32, for a moment twice."""
 
 
 class ServedPolicy(PolicyHost):
@@ -79,14 +81,17 @@ class ServedPolicy(PolicyHost):
         Raises:
             RequestError: it lacks something, or has another shape, in words for the client.
         """
-        found = {k: v for k, v in message.items() if isinstance(k, str) and k.startswith("observation.")}
+        found = {key: message[key] for key in self.expected if key in message}
         for key, value in found.items():
             if not isinstance(value, np.ndarray):
                 raise RequestError(f"{key!r:.100} is a {type(value).__name__}, not an array")
             if value.dtype == np.uint8 and (value.ndim != 3 or value.shape[2] != 3 or not value.size):
                 raise RequestError(f"{key!r:.100} has shape {value.shape}; a uint8 picture is (H, W, 3)")
-            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4:
-                raise RequestError(f"{key!r:.100} has shape {value.shape}")
+            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4 or value.size > _MOST_NUMBERS:
+                raise RequestError(
+                    f"{key!r:.100} has shape {value.shape}; the limits are {_MOST_NUMBERS} numbers, 4 "
+                    f"dimensions and {_LONGEST_SIDE} a side. Make the pictures smaller"
+                )
         pictures = {k for k, f in self.expected.items() if f.type is FeatureType.VISUAL}
         missing = set(self.expected) - set(found)
         # A policy fills in some of its cameras, as it does when it is loaded beside the simulator.
@@ -113,7 +118,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
     """As `lerobot.envs.preprocess_observation` makes tensors: pictures (B, 3, H, W) from 0 to 1, all
     float32."""
     if array.dtype == np.uint8:
-        return torch.from_numpy(array).permute(0, 3, 1, 2).contiguous().type(torch.float32) / 255
+        return torch.from_numpy(array).permute(0, 3, 1, 2).contiguous().type(torch.float32).div_(255)
     return torch.from_numpy(array).float()
 
 
