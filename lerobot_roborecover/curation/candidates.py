@@ -15,7 +15,6 @@ What comes from a file is checked here and trusted afterwards.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.files import read_bytes, what_it_is
+from lerobot_roborecover.datasets.files import load_json, read_bytes, what_it_is
 from lerobot_roborecover.datasets.parquet_read import number_array, open_parquet, read_frames
 from lerobot_roborecover.datasets.schema import FOLDER, MAX_BODIES
 from lerobot_roborecover.datasets.trajectories import (
@@ -169,9 +168,9 @@ class CandidateSet:
         Raises:
             ScenarioError: the file's row is not what `write_candidates` writes.
         """
-        path, count = self._steps_path, self.row(episode).steps
+        path, count = self.root / FOLDER / STEPS_FILE, self.row(episode).steps
         try:
-            with pq.ParquetFile(path) as file:
+            with pq.ParquetFile(self._steps_path) as file:
                 table = file.read_row_group(episode, columns=STEPS_SCHEMA.names)
             names = table["bodies"].combine_chunks().flatten()
             if len(table) != 1 or len(names) > MAX_BODIES:
@@ -259,7 +258,7 @@ def read_candidates(root: str | os.PathLike[str], *, videos: bool = True) -> Can
     data = read_bytes(root, path, MAX_CANDIDATES_BYTES)
     trajectories = read_trajectories(root, videos=videos)
     try:
-        found = json.loads(data)
+        found = load_json(data)
         if found["schema_version"] > SCHEMA_VERSION:
             raise ScenarioError(
                 f"field schema_version: {found['schema_version']} is from the future; upgrade this package: "

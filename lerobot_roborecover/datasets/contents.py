@@ -6,12 +6,13 @@ loaded. Everything else is refused by name.
 
 from __future__ import annotations
 
-import json
+import io
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
+from lerobot_roborecover.datasets.files import load_json
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_FILES = 100_000
@@ -122,7 +123,7 @@ def _check_json(path: Path, name: str, size: int) -> None:
         raise ScenarioError(f"{name} has {size} bytes; the limit of a JSON file is {MAX_JSON_BYTES}")
     text = path.read_bytes()
     try:
-        for line in text.splitlines() if path.suffix == ".jsonl" else [text]:
-            json.loads(line)
+        for line in io.BytesIO(text) if path.suffix == ".jsonl" else [text]:
+            load_json(line)
     except (ValueError, RecursionError) as err:
         raise ScenarioError(f"{name} is not JSON ({err}); fetch or write the dataset again") from None

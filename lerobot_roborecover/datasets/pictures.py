@@ -76,14 +76,14 @@ def grid_png(tiles: Sequence[tuple[str, str, np.ndarray]]) -> bytes:
 
 def _episode_frame(root: Path, row: int) -> np.ndarray | None:
     """The last frame of an episode, from its first camera's video."""
-    import json
-
+    from lerobot_roborecover.datasets.files import load_json, read_bytes
     from lerobot_roborecover.datasets.parquet_read import episodes_of
+    from lerobot_roborecover.datasets.video_frames import MAX_INFO_BYTES
 
     info = root / "meta" / "info.json"
     if not info.is_file():
         return None
-    features = json.loads(info.read_text(encoding="utf-8")).get("features", {})
+    features = load_json(read_bytes(root, info, MAX_INFO_BYTES)).get("features", {})
     cameras = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if not cameras:
         return None

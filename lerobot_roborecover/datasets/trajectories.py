@@ -8,7 +8,6 @@ the frame's scenario, and `meta/roborecover/trajectories.json`: one entry a scen
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.datasets.files import read_bytes, what_it_is
+from lerobot_roborecover.datasets.files import load_json, read_bytes, what_it_is
 from lerobot_roborecover.datasets.parquet_read import read_frames
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.video_frames import check_frames
@@ -127,7 +126,7 @@ def read_trajectories(root: str | os.PathLike[str], *, videos: bool = True) -> T
     path = root / FOLDER / TRAJECTORIES_FILE
     data = read_bytes(root, path, MAX_TRAJECTORIES_BYTES)
     try:
-        found = json.loads(data)
+        found = load_json(data)
         if found["schema_version"] > SCHEMA_VERSION:
             raise ScenarioError(
                 f"{path}, field schema_version: {found['schema_version']} is from the future; upgrade this "

@@ -9,7 +9,6 @@ and where a file's header already says it, not even that. LeRobot is not importe
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
 from lerobot_roborecover.datasets.parquet_read import episodes_of
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -84,7 +83,7 @@ def check_frames(root: Path, steps: Sequence[int] | None = None, *, thorough: bo
 def _cameras(root: Path) -> tuple[list[str], float]:
     path = root / "meta" / "info.json"
     try:
-        info = json.loads(read_bytes(root, path, MAX_INFO_BYTES))
+        info = load_json(read_bytes(root, path, MAX_INFO_BYTES))
         cameras = sorted(k for k, f in info["features"].items() if f["dtype"] == "video")
         fps = float(info["fps"])
         if not 0 < fps <= 1000:

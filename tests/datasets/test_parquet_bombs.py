@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +21,7 @@ from lerobot_roborecover.datasets.contents import check_file
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.parquet_read import read_numbers, read_table
 from lerobot_roborecover.datasets.schema import FOLDER, RESET_OPTIONS, SCHEMA
+from lerobot_roborecover.env.trial_actions import actions_path, read_actions
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_dataset
 from tests.support.memory import peak_bytes
@@ -251,6 +254,26 @@ def test_what_is_no_whole_parquet_is_one_line(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(ScenarioError, match="not a regular file"):
         read_table(tmp_path)
+
+
+def test_json_of_millions_of_lists_is_refused_small(tmp_path):
+    path = tmp_path / "meta" / "file.json"
+    path.parent.mkdir()
+    path.write_text('{"a": [' + "[]," * 20_000_000 + "0]}")
+    said, grown = read_in_child(f"check_file(Path({str(tmp_path)!r}), 'meta/file.json')")
+    assert "JSON lists and objects; the limit is 4194304" in said
+    assert grown < MOST_BYTES
+
+
+def test_a_trial_s_actions_that_claim_gigabytes_are_refused(tmp_path):
+    row = SimpleNamespace(steps=3, trial=0, scenario_id="s", policy="p", actions_sha256="a" * 64)
+    path = actions_path(tmp_path, cast(Any, row))
+    np.save(path, np.zeros((3, 2), np.float32))
+    good = path.read_bytes()
+    assert b"(3, 2), }" in good
+    path.write_bytes(good.replace(b"(3, 2), }" + b" " * 12, b"(3000000000000, 2), }"))
+    with pytest.raises(ScenarioError, match="its actions cannot be read"):
+        read_actions(tmp_path, cast(Any, row))
 
 
 # --- honest files

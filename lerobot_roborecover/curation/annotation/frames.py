@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import struct
 import threading
 from collections import OrderedDict, deque
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
 from lerobot_roborecover.datasets.parquet_read import episodes_of
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -57,7 +56,7 @@ class Videos:
         self.root = root
         path = root / "meta" / "info.json"
         try:
-            info = json.loads(read_bytes(root, path, MAX_INFO_BYTES))
+            info = load_json(read_bytes(root, path, MAX_INFO_BYTES))
             self.fps = float(info["fps"])
             self.cameras = sorted(k for k, f in info["features"].items() if f["dtype"] == "video")
             if not 0 < self.fps <= 1000:
