@@ -41,7 +41,7 @@ class ServeConfig:
     max_connections: int = 256
     """Clients connected at once."""
     max_pending_mb: int = 256
-    """Of requests of all clients that are not answered yet; over it the server reads one after the other."""
+    """Of requests of all clients that are not answered yet; one frame always fits."""
     certfile: str = ""
     """TLS certificate chain, PEM: clients then say wss:// (--certfile CERT --keyfile KEY)."""
     keyfile: str = ""
@@ -76,7 +76,7 @@ class ServeConfig:
             ("max_frame_mb", 1, 4096),
             ("max_sessions", 1, 10**6),
             ("max_connections", 1, 10_000),
-            ("max_pending_mb", self.max_frame_mb, 2**20),
+            ("max_pending_mb", 1, 2**20),
         ):
             if not low <= getattr(self, name) <= high:
                 raise OptionError(f"--{name}={getattr(self, name)}: must be from {low} to {high}")
@@ -143,7 +143,7 @@ def serve(cfg: ServeConfig) -> int:
     policy = cfg.check()
     options = ServeOptions(
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
-        cfg.max_connections, cfg.max_pending_mb * 2**20, api_key(), cfg.certfile, cfg.keyfile,
+        cfg.max_connections, max(cfg.max_pending_mb, cfg.max_frame_mb) * 2**20, api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
     served = load_served(policy, cfg.rename_map, cfg.max_batch)
     server = PolicyServer(served, public_name(str(policy.pretrained_path)), options)

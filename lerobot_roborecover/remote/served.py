@@ -81,13 +81,14 @@ class ServedPolicy(PolicyHost):
         Raises:
             RequestError: it lacks something, or has another shape, in words for the client.
         """
-        found = {key: message[key] for key in self.expected if key in message}
+        found = {k: v for k, v in message.items() if isinstance(k, str) and k.startswith("observation.")}
         for key, value in found.items():
             if not isinstance(value, np.ndarray):
                 raise RequestError(f"{key!r:.100} is a {type(value).__name__}, not an array")
             if value.dtype == np.uint8 and (value.ndim != 3 or value.shape[2] != 3 or not value.size):
                 raise RequestError(f"{key!r:.100} has shape {value.shape}; a uint8 picture is (H, W, 3)")
-            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4 or value.size > _MOST_NUMBERS:
+            size = value.size if key in self.expected else 0
+            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4 or size > _MOST_NUMBERS:
                 raise RequestError(
                     f"{key!r:.100} has shape {value.shape}; the limits are {_MOST_NUMBERS} numbers, 4 "
                     f"dimensions and {_LONGEST_SIDE} a side. Make the pictures smaller"
@@ -105,7 +106,8 @@ class ServedPolicy(PolicyHost):
                 raise RequestError(
                     f"{key!r} has shape {found[key].shape}; this policy takes {tuple(feature.shape)}"
                 )
-        return found
+        # What the policy does not take is neither kept nor converted.
+        return {key: found[key] for key in self.expected if key in found}
 
     def _prepare(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
         keys = observations[0]

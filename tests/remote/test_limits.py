@@ -75,7 +75,7 @@ def request(size, value=1):
 def test_what_the_policy_does_not_take_is_not_converted(checkpoints):  # noqa: F811
     policy = load(checkpoints, "act")
     extra = {f"observation.images.extra{i}": np.zeros((900, 900, 3), np.uint8) for i in range(3)}
-    taken = policy.check({**STATE, **extra, "observation.words": "none", "task": "push"})
+    taken = policy.check({**STATE, **extra, "task": "push"})
     assert set(taken) == set(STATE)
     key = "observation.images.front"
     policy.expected[key] = type("Feature", (), {"shape": (3, 96, 96), "type": "VISUAL"})()
