@@ -141,9 +141,10 @@ def public_name(path: str) -> str:
 def serve(cfg: ServeConfig) -> int:
     """Serves until it is interrupted; see `main`."""
     policy = cfg.check()
+    pending_mb = max(cfg.max_pending_mb, cfg.max_frame_mb)
     options = ServeOptions(
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
-        cfg.max_connections, max(cfg.max_pending_mb, cfg.max_frame_mb) * 2**20, api_key(), cfg.certfile, cfg.keyfile,
+        cfg.max_connections, pending_mb * 2**20, api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
     served = load_served(policy, cfg.rename_map, cfg.max_batch)
     server = PolicyServer(served, public_name(str(policy.pretrained_path)), options)
