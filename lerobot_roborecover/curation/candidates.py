@@ -15,7 +15,6 @@ What comes from a file is checked here and trusted afterwards.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,8 +26,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.files import read_bytes, what_it_is
-from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.files import load_json, read_bytes, what_it_is
+from lerobot_roborecover.datasets.parquet_read import number_array, open_parquet, read_frames
+from lerobot_roborecover.datasets.schema import FOLDER, MAX_BODIES
 from lerobot_roborecover.datasets.trajectories import (
     TrajectoryRow,
     TrajectorySet,
@@ -168,15 +168,20 @@ class CandidateSet:
         Raises:
             ScenarioError: the file's row is not what `write_candidates` writes.
         """
-        path = self.root / FOLDER / STEPS_FILE
+        path, count = self.root / FOLDER / STEPS_FILE, self.row(episode).steps
         try:
-            with pq.ParquetFile(path) as file:
-                row = file.read_row_group(episode).to_pylist()[0]
-            count = self.row(episode).steps
-            poses = np.array(row["poses"], dtype=np.float64).reshape(len(row["bodies"]), count + 1, 7)
-            solved = np.array(row["solved"], dtype=bool)
-            perturbation = np.array(row["perturbation"], dtype=np.int8)
-            if row["episode_index"] != episode or solved.shape != (count + 1,):
+            with pq.ParquetFile(self._steps_path) as file:
+                table = file.read_row_group(episode, columns=STEPS_SCHEMA.names)
+            names = table["bodies"].combine_chunks().flatten()
+            if len(table) != 1 or len(names) > MAX_BODIES:
+                raise ValueError(f"{len(table)} rows, {len(names)} bodies; the limit is {MAX_BODIES}")
+            bodies = names.to_pylist()
+            number, poses, solved, perturbation = (
+                number_array(table[name])[0] for name in STEPS_SCHEMA.names if name != "bodies"
+            )
+            poses = poses.astype(np.float64).reshape(len(bodies), count + 1, 7)
+            solved, perturbation = solved.astype(bool), perturbation.astype(np.int8)
+            if number != episode or solved.shape != (count + 1,):
                 raise ValueError("of another episode")
             if perturbation.shape != (count,) or not np.isfinite(poses).all():
                 raise ValueError("of another length, or not finite")
@@ -185,7 +190,14 @@ class CandidateSet:
                 f"{path}: row {episode} is not what write_candidates writes ({err!s:.200}). Fetch or write "
                 "the dataset again"
             ) from None
-        return Steps(dict(zip(row["bodies"], poses, strict=True)), solved, perturbation)
+        return Steps(dict(zip(bodies, poses, strict=True)), solved, perturbation)
+
+    @cached_property
+    def _steps_path(self) -> Path:
+        """The file of `steps`, once its decoded size is known to be bounded."""
+        path = self.root / FOLDER / STEPS_FILE
+        with open_parquet(path):
+            return path
 
     def scenario(
         self, candidate_id: str, step: int, stage: Stage, deviation: DeviationType, provenance: dict[str, Any]
@@ -246,7 +258,7 @@ def read_candidates(root: str | os.PathLike[str], *, videos: bool = True) -> Can
     data = read_bytes(root, path, MAX_CANDIDATES_BYTES)
     trajectories = read_trajectories(root, videos=videos)
     try:
-        found = json.loads(data)
+        found = load_json(data)
         if found["schema_version"] > SCHEMA_VERSION:
             raise ScenarioError(
                 f"field schema_version: {found['schema_version']} is from the future; upgrade this package: "
@@ -303,25 +315,8 @@ def exact_actions(root: Path) -> list[np.ndarray]:
     """
     from lerobot_roborecover.datasets.episodes import EXACT_ACTION
 
-    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for path in sorted((root / "data").rglob("*.parquet")):
-        try:
-            table = pq.read_table(path, columns=["episode_index", "frame_index", EXACT_ACTION])
-            episodes, frames = (table[n].to_numpy() for n in ("episode_index", "frame_index"))
-            column = table[EXACT_ACTION].combine_chunks()
-            # LeRobot stores features of one value as plain numbers, not as lists.
-            values = column.flatten() if pa.types.is_nested(column.type) else column
-            actions = np.asarray(values, dtype=np.float64).reshape(len(episodes), -1)
-        except (OSError, ValueError, KeyError, pa.ArrowException) as err:
-            raise ScenarioError(f"{path} has no exact actions ({err!s:.200}); fetch it again") from None
-        order = np.lexsort((frames, episodes))
-        numbers, starts = np.unique(episodes[order], return_index=True)
-        for number, rows in zip(numbers.tolist(), np.split(order, starts[1:]), strict=True):
-            found.setdefault(number, []).append((frames[rows], actions[rows]))
-    result = []
+    found = read_frames(root, (EXACT_ACTION,))
     for number in range(len(found)):
         if number not in found:
             raise ScenarioError(f"{root}/data holds no frames of episode {number}; fetch the dataset again")
-        frames = np.concatenate([f for f, _ in found[number]])
-        result.append(np.concatenate([a for _, a in found[number]])[np.argsort(frames, kind="stable")])
-    return result
+    return [found[number][EXACT_ACTION].astype(np.float64, copy=False) for number in range(len(found))]

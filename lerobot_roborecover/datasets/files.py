@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import stat
 from pathlib import Path
+from typing import Any
 
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE, SCENARIOS_FILE
 from lerobot_roborecover.scenario import ScenarioError
+
+MAX_JSON_CONTAINERS = 2**22
 
 
 def read_bytes(root: Path, path: Path, limit: int) -> bytes:
@@ -44,6 +48,18 @@ def read_bytes(root: Path, path: Path, limit: int) -> bytes:
         ) from None
     except (OSError, RuntimeError) as err:
         raise ScenarioError(f"{path} cannot be read: {err}. Check its permissions and links") from err
+
+
+def load_json(data: bytes) -> Any:
+    """Parses JSON whose lists and objects are counted first: two bytes of text are a hundred of memory.
+
+    Raises:
+        ValueError: it is not JSON, or holds too many.
+    """
+    containers = data.count(b"{") + data.count(b"[")
+    if containers > MAX_JSON_CONTAINERS:
+        raise ValueError(f"{containers} JSON lists and objects; the limit is {MAX_JSON_CONTAINERS}")
+    return json.loads(data)
 
 
 def what_it_is(data: bytes) -> str:

@@ -31,6 +31,7 @@ from lerobot_roborecover.scenario import Scenario, ScenarioError
 FRAMES_FOLDER = "frames"
 MAX_FRAMES_BYTES = 2**28
 """Of one file; a writer begins the next one at half of it."""
+MAX_CAMERAS = 64
 _NAME = re.compile(FRAMES_FOLDER + r"/file-[0-9]{3,}\.parquet")
 
 SCHEMA = pa.schema(
@@ -123,7 +124,14 @@ class FrameStore(Mapping[str, LastFrames]):
 
     def __getitem__(self, scenario_id: str) -> LastFrames:
         name, group = self._places[scenario_id]
-        rows = self._file(name).read_row_group(group).to_pylist()
+        table = self._file(name).read_row_group(group, columns=SCHEMA.names)
+        lists = table["frames_png"].combine_chunks()
+        if len(table) > MAX_CAMERAS or len(lists.flatten()) > len(table) * MAX_FRAMES:
+            raise ScenarioError(
+                f"{self._path(name)}: scenario {scenario_id:.200} has {len(lists.flatten())} frames of "
+                f"{len(table)} cameras; the limits are {MAX_CAMERAS} cameras and {MAX_FRAMES} frames of each"
+            )
+        rows = table.to_pylist()
         png = {row["camera"]: tuple(row["frames_png"]) for row in rows}
         found = LastFrames(scenario_id, rows[0]["sha256"], rows[0]["step"], png)
         try:

@@ -1,51 +1,67 @@
 """Bounds what decoding an untrusted parquet takes, before any of it is decoded.
 
 A few bytes of parquet can stand for gigabytes: compressed pages, dictionary entries repeated by run lengths,
-nulls. Scenario files hold never-null values as they are, at most sorted by byte, so that their decoded size
-is their uncompressed size; this module insists on that and on the size. The sizes in a footer can lie, and
-the Arrow reader believes each page's own header, so the page headers are what is added up here.
+empty lists, nulls. The sizes in a footer can lie, so the page headers are what is added up here. What a file
+decodes to may be `SLACK_BYTES` and so many times the file's own size. Scenario files are held to more: they
+hold never-null values as they are, at most sorted by byte.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_roborecover.datasets.parquet_pages import (
+    BYTE_ARRAY,
+    BYTE_STREAM_SPLIT,
+    CODECS,
+    DICTIONARY,
+    ENCODINGS,
+    PLAIN,
+    Chunk,
+    Page,
+    PagesError,
+    read_chunks,
+)
 from lerobot_roborecover.datasets.schema import MAX_SCENARIOS, MAX_UNCOMPRESSED_BYTES, SCHEMA
 from lerobot_roborecover.scenario import ScenarioError
 
-MAX_FOOTER_BYTES = 2**24
 MAX_PAGES = 2**20
 MAX_VALUES = MAX_UNCOMPRESSED_BYTES // 8
-
-# Field numbers of the Thrift structs that are read here:
-# https://github.com/apache/parquet-format/blob/master/src/main/thrift/parquet.thrift
-_ROW_GROUPS, _COLUMNS, _META_DATA = 4, 1, 3
-_PATH, _CHUNK_BYTES, _DATA_PAGE_AT, _DICTIONARY_PAGE_AT = 3, 7, 9, 11
-_TYPE, _UNCOMPRESSED, _COMPRESSED = 1, 2, 3
-_NUM_VALUES = 1
-_DATA_PAGES = {0: (5, 2), 3: (8, 4)}
-"""Page type to (field of its own header, field of the encoding in that): data pages of version 1 and 2."""
-_AS_THEY_ARE = {0, 9}
-"""Encodings that change no value's size: PLAIN and BYTE_STREAM_SPLIT."""
+SLACK_BYTES = 2**26
+MAX_EXPANSION = 200
+"""Honest recordings decode to some 3 to 30 times their file's size."""
+MAX_SCENARIO_EXPANSION = 50
+"""Scenario files hold no dictionaries; honest ones decode to 2 to 4 times their size."""
+_VALUE_BYTES = 16
+"""What Arrow keeps of any value, at most: the number, its levels while it is read, offsets of its lists."""
 
 
-def check_bounds(path: Path, data: bytes, schema: pa.Schema = SCHEMA) -> None:
-    """Checks columns, row count, encodings and uncompressed sizes.
+def check_bounds(
+    path: Path, data: bytes, schema: pa.Schema = SCHEMA, optional: Sequence[pa.Field] = ()
+) -> pa.Schema:
+    """Checks columns, row count, encodings and decoded sizes of a scenario file.
 
     Args:
         path: for messages only.
         data: the whole file.
         schema: columns that it must have.
+        optional: columns that it may have.
+
+    Returns:
+        The columns to read.
 
     Raises:
         ScenarioError: a column is missing or of another type, or a bound is exceeded.
         pyarrow.ArrowException, OSError, ValueError: the file is not decodable at all.
     """
+    chunks = _chunks(path, data)
     file = pq.ParquetFile(pa.BufferReader(data))
+    schema = pa.schema([*schema, *(f for f in optional if f.name in file.schema_arrow.names)])
     for field in schema:
         at = file.schema_arrow.get_field_index(field.name)
         if at < 0:
@@ -59,141 +75,156 @@ def check_bounds(path: Path, data: bytes, schema: pa.Schema = SCHEMA) -> None:
     rows = file.metadata.num_rows
     if rows > MAX_SCENARIOS:
         raise ScenarioError(f"{path} has {rows} rows; the limit is {MAX_SCENARIOS}. Split the dataset")
-    sizes = {"pages": 0, "values": 0, "bytes uncompressed": 0}
     # Every column, also those that the schema does not name: what a column is called here and which one the
     # Arrow reader takes it for need not agree.
-    for column in _columns(path, data):
-        _add_pages(path, data, column, sizes)
+    _add_up(path, data, chunks, MAX_SCENARIO_EXPANSION, plain=True)
+    return schema
 
 
-def _columns(path: Path, data: bytes) -> list[dict[int, Any]]:
-    """The metadata of every column chunk, by field number.
+def check_decoded_size(path: Path, data: Any) -> int:
+    """Checks how large any parquet file is once it is decoded, all of its columns together.
 
-    Read from the footer here, because pyarrow's accessors end the whole process on some malformed statistics.
-    """
-    length = int.from_bytes(data[-8:-4], "little")
-    if length > min(MAX_FOOTER_BYTES, len(data) - 12):
-        raise ScenarioError(
-            f"{path}: the footer claims {length} bytes of {len(data)}; the limit is {MAX_FOOTER_BYTES}"
-        )
-    try:
-        footer, _ = _read_struct(data, len(data) - 8 - length)
-        columns = [chunk[_META_DATA] for group in footer[_ROW_GROUPS] for chunk in group[_COLUMNS]]
-        for column in columns:
-            if not _whole(column[_CHUNK_BYTES], column[_DATA_PAGE_AT]):
-                raise TypeError("not a size")
-            column[_PATH] = [name.decode() for name in column[_PATH]]
-    except (AttributeError, IndexError, KeyError, TypeError, RecursionError) as err:
-        raise ScenarioError(f"{path} has a malformed footer ({err!r:.100}); fetch the file again") from err
-    return columns
-
-
-def _add_pages(path: Path, data: bytes, column: dict[int, Any], sizes: dict[str, int]) -> None:
-    """Adds the pages, values and uncompressed bytes of one column chunk to `sizes` and checks the sums."""
-    where = f"{path}: field {'.'.join(column[_PATH])}"
-    not_plain = (
-        f"{where} is not of plain values without a dictionary, so that its decoded size has no bound; write "
-        "the file with write_scenarios"
-    )
-    if _DICTIONARY_PAGE_AT in column:
-        raise ScenarioError(not_plain)
-    at = column[_DATA_PAGE_AT]
-    end = at + column[_CHUNK_BYTES]
-    if end > len(data):
-        raise ScenarioError(f"{where} lies at bytes {at} to {end} of {len(data)}; fetch the file again")
-    while at < end:
-        try:
-            header, after = _read_struct(data, at)
-            own, encoding = _DATA_PAGES.get(header[_TYPE], (0, 0))
-            if not own or header[own][encoding] not in _AS_THEY_ARE:
-                raise ScenarioError(not_plain)
-            page = {
-                "pages": 1,
-                "values": header[own][_NUM_VALUES],
-                "bytes uncompressed": header[_UNCOMPRESSED],
-            }
-            if not _whole(header[_COMPRESSED], *page.values()):
-                raise TypeError("not a size")
-        except (IndexError, KeyError, TypeError, RecursionError) as err:
-            raise ScenarioError(
-                f"{where} has a malformed page at byte {at} ({err!r:.100}); fetch the file again"
-            ) from err
-        at = after + header[_COMPRESSED]
-        for (unit, size), limit in zip(
-            page.items(), (MAX_PAGES, MAX_VALUES, MAX_UNCOMPRESSED_BYTES), strict=True
-        ):
-            sizes[unit] += size
-            if sizes[unit] > limit:
-                raise ScenarioError(
-                    f"{where}: up to here the file holds {sizes[unit]} {unit}; the limit is {limit}. Leave "
-                    "out fingerprint frames, or split the dataset"
-                )
-
-
-def _whole(*values: object) -> bool:
-    return all(type(value) is int and value >= 0 for value in values)
-
-
-def _read_struct(data: bytes, at: int) -> tuple[dict[int, Any], int]:
-    """A struct of Thrift's compact protocol.
+    Args:
+        path: for messages only.
+        data: the whole file, as bytes or a memory map.
 
     Returns:
-        Values by field number, and the position after the struct.
+        The number of values in the file.
 
     Raises:
-        IndexError: the data ends within it.
-        KeyError: it holds a field twice, or a kind of value that parquet metadata does not have.
+        ScenarioError: the file is malformed, or decodes to more than `MAX_EXPANSION` times its size.
     """
-    fields: dict[int, Any] = {}
-    number = 0
-    while head := data[at]:
-        at += 1
-        delta, kind = head >> 4, head & 15
-        if delta:
-            number += delta
-        else:
-            number, at = _read_integer(data, at)
-        if number in fields:
-            raise KeyError(f"field {number} twice")
-        if kind in (1, 2):
-            fields[number] = kind == 1
-        else:
-            fields[number], at = _read_value(data, at, kind)
-    return fields, at + 1
+    chunks = _chunks(path, data)
+    _add_up(path, data, chunks, MAX_EXPANSION, plain=False)
+    return sum(chunk.values for chunk in chunks)
 
 
-def _read_value(data: bytes, at: int, kind: int) -> tuple[Any, int]:
-    if kind in (1, 2, 3):
-        return data[at], at + 1
-    if kind in (4, 5, 6):
-        return _read_integer(data, at)
-    if kind == 8:
-        length, at = _read_varint(data, at)
-        return data[at : at + length], at + length
-    if kind == 9:
-        count, kind, at = data[at] >> 4, data[at] & 15, at + 1
-        if count == 15:
-            count, at = _read_varint(data, at)
-        values = []
-        for _ in range(count):
-            value, at = _read_value(data, at, kind)
-            values.append(value)
-        return values, at
-    if kind == 12:
-        return _read_struct(data, at)
-    raise KeyError(f"kind {kind}")
+def check_fixed_lists(path: Path, file: pq.ParquetFile, values: int) -> None:
+    """Checks lists of a fixed size, which take that size also where they are null and hold no value.
+
+    Args:
+        path: for the size and messages.
+        file: opened.
+        values: of `check_decoded_size`.
+
+    Raises:
+        ScenarioError: they decode to more than `MAX_EXPANSION` times the file's size.
+    """
+    rows, limit = file.metadata.num_rows, SLACK_BYTES + MAX_EXPANSION * path.stat().st_size
+    decoded = sum(_fixed_bytes(field.type, rows, values) for field in file.schema_arrow)
+    if decoded > limit:
+        raise ScenarioError(_too_much(f"{path}: lists of a fixed size", decoded, "bytes decoded", limit))
 
 
-def _read_integer(data: bytes, at: int) -> tuple[int, int]:
-    value, at = _read_varint(data, at)
-    return (value >> 1) ^ -(value & 1), at
+def _chunks(path: Path, data: Any) -> list[Chunk]:
+    try:
+        return read_chunks(data)
+    except PagesError as err:
+        raise ScenarioError(f"{path}: {err}") from None
 
 
-def _read_varint(data: bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        value |= (data[at] & 127) << shift
-        at += 1
-        if data[at - 1] < 128:
-            return value, at
-    raise IndexError(at)
+def _add_up(path: Path, data: Any, chunks: list[Chunk], expansion: int, *, plain: bool) -> None:
+    """Adds up the pages of all column chunks and checks every sum on the way."""
+    most = SLACK_BYTES + expansion * len(data)
+    limits = {
+        "pages": MAX_PAGES,
+        "values": MAX_VALUES if plain else most // _VALUE_BYTES,
+        "bytes uncompressed": min(MAX_UNCOMPRESSED_BYTES, most) if plain else most,
+        "bytes decoded": most,
+    }
+    sums = dict.fromkeys(limits, 0)
+    for chunk in chunks:
+        where = f"{path}: field {chunk.name}"
+        values, dictionary = 0, None
+        try:
+            for page in chunk.pages(data):
+                if (page.encoding not in ENCODINGS and page.encoding >= 0) or (plain and not _is_plain(page)):
+                    raise ScenarioError(_NOT_PLAIN.format(where) if plain else _UNBOUNDED.format(where))
+                values += 0 if page.dictionary else page.values
+                sums["pages"] += 1
+                sums["values"] += page.values
+                sums["bytes uncompressed"] += page.uncompressed
+                sums["bytes decoded"] += page.uncompressed + page.values * (_VALUE_BYTES + chunk.width)
+                _check(where, sums, limits)
+                if page.dictionary:
+                    dictionary = page
+                elif page.encoding in DICTIONARY and chunk.kind == BYTE_ARRAY:
+                    left = most - sums["bytes decoded"]
+                    sums["bytes decoded"] += _dictionary_bytes(where, data, chunk, dictionary, page, left)
+                    _check(where, sums, limits)
+        except PagesError as err:
+            raise ScenarioError(f"{path}: {err}") from None
+        if values != chunk.values:
+            raise ScenarioError(
+                f"{where}: its pages hold {values} values, the footer says {chunk.values}; fetch it again"
+            )
+
+
+_NOT_PLAIN = (
+    "{} is not of plain values without a dictionary, so that its decoded size has no bound; write the file "
+    "with write_scenarios"
+)
+_UNBOUNDED = (
+    "{} is of an encoding whose decoded size has no bound; write the file again with pyarrow's own encodings"
+)
+
+
+def _is_plain(page: Page) -> bool:
+    return not page.dictionary and page.encoding in (PLAIN, BYTE_STREAM_SPLIT)
+
+
+def _check(where: str, sums: dict[str, int], limits: dict[str, int]) -> None:
+    for unit, limit in limits.items():
+        if sums[unit] > limit:
+            raise ScenarioError(_too_much(where, sums[unit], unit, limit))
+
+
+def _too_much(where: str, size: int, unit: str, limit: int) -> str:
+    return (
+        f"{where}: up to here the file holds {size} {unit}; the limit is {limit}. Leave out fingerprint "
+        "frames, or split the dataset"
+    )
+
+
+def _dictionary_bytes(
+    where: str, data: Any, chunk: Chunk, dictionary: Page | None, page: Page, left: int
+) -> int:
+    """Returns a bound of the bytes that a page's values take once they are copied from the dictionary."""
+    if dictionary is None:
+        raise ScenarioError(f"{where} has no dictionary; fetch the file again")
+    if page.values * dictionary.uncompressed <= left:
+        return page.values * dictionary.uncompressed
+    packed = data[dictionary.at : dictionary.at + dictionary.compressed]
+    try:
+        codec = CODECS[chunk.codec]
+        entries = packed if codec is None else pa.Codec(codec).decompress(packed, dictionary.uncompressed)
+    except (KeyError, ValueError, OSError, pa.ArrowException) as err:
+        raise ScenarioError(
+            f"{where}: its dictionary cannot be read ({err!r:.100}); fetch the file again"
+        ) from None
+    entries, longest, at = memoryview(entries), 0, 0
+    for _ in range(dictionary.values):
+        length = int.from_bytes(entries[at : at + 4], "little")
+        longest, at = max(longest, length), at + 4 + length
+        if at > len(entries):
+            raise ScenarioError(f"{where}: its dictionary ends early; fetch the file again")
+    return page.values * longest
+
+
+def _fixed_bytes(kind: pa.DataType, slots: int, values: int) -> int:
+    """Returns a bound of the bytes that lists of a fixed size take, in all levels of a type.
+
+    Args:
+        kind: of a column, or of what it holds.
+        slots: elements of that type.
+        values: in the whole file: elements of a list whose size is not fixed are no more.
+    """
+    if isinstance(kind, pa.BaseExtensionType):
+        return _fixed_bytes(kind.storage_type, slots, values)
+    fixed = pa.types.is_fixed_size_list(kind)
+    if fixed:
+        slots *= kind.list_size
+    elif not pa.types.is_struct(kind):
+        slots = values
+    inner = sum(_fixed_bytes(kind.field(i).type, slots, values) for i in range(kind.num_fields))
+    return inner + (slots * _VALUE_BYTES if fixed else 0)

@@ -76,27 +76,23 @@ def grid_png(tiles: Sequence[tuple[str, str, np.ndarray]]) -> bytes:
 
 def _episode_frame(root: Path, row: int) -> np.ndarray | None:
     """The last frame of an episode, from its first camera's video."""
-    import json
-
-    import pyarrow.parquet as pq
+    from lerobot_roborecover.datasets.files import load_json, read_bytes
+    from lerobot_roborecover.datasets.parquet_read import episodes_of
+    from lerobot_roborecover.datasets.video_frames import MAX_INFO_BYTES
 
     info = root / "meta" / "info.json"
     if not info.is_file():
         return None
-    features = json.loads(info.read_text(encoding="utf-8")).get("features", {})
+    features = load_json(read_bytes(root, info, MAX_INFO_BYTES)).get("features", {})
     cameras = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if not cameras:
         return None
     key = cameras[0]
     names = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "to_timestamp")]
-    for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
-        table = pq.read_table(path, columns=["episode_index", *names]).to_pylist()
-        for episode in table:
-            if episode["episode_index"] == row:
-                chunk, file, end = (episode[name] for name in names)
-                return _frame_before(
-                    root / "videos" / key / f"chunk-{chunk:03d}" / f"file-{file:03d}.mp4", end
-                )
+    for _, table in episodes_of(root, ["episode_index", *names]):
+        for at in (table["episode_index"] == row).nonzero()[0]:
+            chunk, file, end = (table[name][at].item() for name in names)
+            return _frame_before(root / "videos" / key / f"chunk-{chunk:03d}" / f"file-{file:03d}.mp4", end)
     return None
 
 

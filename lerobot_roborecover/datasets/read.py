@@ -25,6 +25,14 @@ import pyarrow.parquet as pq
 
 from lerobot_roborecover.datasets.files import read_bytes, what_it_is
 from lerobot_roborecover.datasets.parquet_bounds import check_bounds
+from lerobot_roborecover.datasets.parquet_read import number_view
+from lerobot_roborecover.datasets.row_limits import (
+    JSON_CONTAINERS_PER_ROW,
+    MAX_JSON_CONTAINERS,
+    RowTooLongError,
+    check_lengths,
+    json_containers,
+)
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
     MANIFEST_FILE,
@@ -110,35 +118,48 @@ def _refuse_constant(name: str) -> None:
 
 
 def _parse(path: Path, data: bytes) -> list[Scenario]:
+    scenarios: list[Scenario] = []
+    containers = 0
+    for batch in _batches(path, data):
+        row = len(scenarios)
+        try:
+            check_lengths(batch)
+        except RowTooLongError as err:
+            long = batch.column("id")[err.row].as_py()
+            raise ScenarioError(f"{path}: row {row + err.row} (scenario {long!r:.140}): {err}") from None
+        containers += json_containers(batch)
+        limit = MAX_JSON_CONTAINERS + JSON_CONTAINERS_PER_ROW * (row + len(batch))
+        if containers > limit:
+            raise ScenarioError(
+                f"{path}: up to row {row + len(batch) - 1}, field provenance holds {containers} JSON lists "
+                f"and objects; the limit is {limit}. Keep less in provenance, or split the dataset"
+            )
+        scenarios.extend(_scenarios(path, batch, row))
+    return scenarios
+
+
+def _batches(path: Path, data: bytes) -> Iterator[pa.RecordBatch]:
+    """Yields the rows, some dozens at a time; no more than a row group is decoded at once."""
     try:
+        schema = check_bounds(path, data, SCHEMA, optional=[RESET_OPTIONS])
         with pq.ParquetFile(pa.BufferReader(data)) as file:
-            optional = [RESET_OPTIONS] if RESET_OPTIONS.name in file.schema_arrow.names else []
-        schema = pa.schema([*SCHEMA, *optional])
-        check_bounds(path, data, schema)
-        with pq.ParquetFile(pa.BufferReader(data)) as file:
-            table = file.read(columns=schema.names, use_threads=False)
-        table.validate(full=True)
+            for group in range(file.num_row_groups):
+                table = file.read_row_group(group, columns=schema.names, use_threads=False)
+                table.validate(full=True)
+                yield from table.to_batches(max_chunksize=64)
     except ScenarioError:
         raise
     except (pa.ArrowException, OSError, ValueError, OverflowError) as err:
         raise ScenarioError(f"{path} cannot be decoded as parquet: {str(err)[:300]}. {_FETCH_AGAIN}") from err
-    scenarios = []
-    row = 0
-    for batch in table.to_batches(max_chunksize=64):
-        prefixes = batch.column("prefix")
-        offsets, values = _numbers(prefixes.offsets, np.int32), _numbers(prefixes.values, np.float64)
-        for i, record in enumerate(batch.drop_columns(["prefix"]).to_pylist()):
-            with _at(f"{path}: row {row} (scenario {record['id']!r:.140})"):
-                scenarios.append(_to_scenario(record, values[offsets[i] : offsets[i + 1]].copy()))
-            row += 1
-    return scenarios
 
 
-def _numbers(array: pa.Array, dtype: type[np.generic]) -> np.ndarray:
-    """A view of an Arrow array without nulls; its own `to_numpy` imports pandas, which takes seconds."""
-    if not len(array):
-        return np.empty(0, dtype)
-    return np.frombuffer(array.buffers()[1], dtype, len(array), array.offset * np.dtype(dtype).itemsize)
+def _scenarios(path: Path, batch: pa.RecordBatch, row: int) -> Iterator[Scenario]:
+    """Yields the scenarios of rows whose first is row `row` of its file."""
+    prefixes = batch.column("prefix")
+    offsets, values = number_view(prefixes.offsets), number_view(prefixes.values)
+    for i, record in enumerate(batch.drop_columns(["prefix"]).to_pylist()):
+        with _at(f"{path}: row {row + i} (scenario {record['id']!r:.140})"):
+            yield _to_scenario(record, values[offsets[i] : offsets[i + 1]].copy())
 
 
 def _to_scenario(record: Mapping[str, Any], prefix: np.ndarray) -> Scenario:

@@ -222,15 +222,17 @@ def _renumber(root: Path, rows: Sequence[int]) -> int:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from lerobot_roborecover.datasets.parquet_read import number_array, read_table
+
     changed = 0
     staged: list[tuple[Path, Path]] = []
     try:
         for path in sorted((root / "data").rglob("*.parquet")):
-            table = pq.read_table(path)
+            table = read_table(path)
             position = table.schema.get_field_index(SCENARIO_INDEX)
             field = table.schema.field(position)
-            old = [v[0] if isinstance(v, list) else v for v in table[SCENARIO_INDEX].to_pylist()]
-            new = [rows[e] for e in table["episode_index"].to_pylist()]
+            old = number_array(table[SCENARIO_INDEX]).reshape(len(table), -1)[:, 0].tolist()
+            new = [rows[e] for e in number_array(table["episode_index"]).tolist()]
             if old == new:
                 continue
             changed += sum(a != b for a, b in zip(old, new, strict=True))
@@ -250,19 +252,16 @@ def _renumber(root: Path, rows: Sequence[int]) -> int:
 
 def _labels(root: Path, links: Sequence[ScenarioLink]) -> dict[tuple[str, int], int]:
     """Frames by split and label, where the data is of a monitor."""
-    import pyarrow.parquet as pq
-
+    from lerobot_roborecover.datasets.parquet_read import column_names, read_numbers
     from lerobot_roborecover.datasets.trajectories import LABEL
 
     counts: dict[tuple[str, int], int] = {}
     for path in sorted((root / "data").rglob("*.parquet")):
-        names = pq.read_schema(path).names
-        if LABEL not in names:
+        if LABEL not in column_names(path):
             continue
-        table = pq.read_table(path, columns=[LABEL, SCENARIO_INDEX])
-        for label, index in zip(*(table[name].to_pylist() for name in (LABEL, SCENARIO_INDEX)), strict=True):
-            label = label[0] if isinstance(label, list) else label
-            index = index[0] if isinstance(index, list) else index
+        table = read_numbers(path, [LABEL, SCENARIO_INDEX])
+        columns = (table[name].reshape(len(table[name]), -1)[:, 0] for name in (LABEL, SCENARIO_INDEX))
+        for label, index in zip(*(column.tolist() for column in columns), strict=True):
             if index >= 0:
                 key = (links[index].split, int(label))
                 counts[key] = counts.get(key, 0) + 1

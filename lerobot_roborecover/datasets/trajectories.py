@@ -8,7 +8,6 @@ the frame's scenario, and `meta/roborecover/trajectories.json`: one entry a scen
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.datasets.files import read_bytes, what_it_is
+from lerobot_roborecover.datasets.files import load_json, read_bytes, what_it_is
+from lerobot_roborecover.datasets.parquet_read import read_frames
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
@@ -126,7 +126,7 @@ def read_trajectories(root: str | os.PathLike[str], *, videos: bool = True) -> T
     path = root / FOLDER / TRAJECTORIES_FILE
     data = read_bytes(root, path, MAX_TRAJECTORIES_BYTES)
     try:
-        found = json.loads(data)
+        found = load_json(data)
         if found["schema_version"] > SCHEMA_VERSION:
             raise ScenarioError(
                 f"{path}, field schema_version: {found['schema_version']} is from the future; upgrade this "
@@ -192,30 +192,16 @@ def read_exact(root: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     Raises:
         ScenarioError: the data lacks our columns.
     """
-    import pyarrow.parquet as pq
-
     from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 
-    found: dict[int, list[tuple[int, np.ndarray, int]]] = {}
-    for path in sorted((root / "data").rglob("*.parquet")):
-        names = set(pq.read_schema(path).names)
-        missing = {EXACT_ACTION, SCENARIO_INDEX} - names
-        if missing:
-            raise ScenarioError(f"{path} has no column {min(missing)}; it is not a dataset of this package")
-        table = pq.read_table(path, columns=["episode_index", "frame_index", EXACT_ACTION, SCENARIO_INDEX])
-        rows = zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
-        for episode, frame, action, index in rows:
-            value = index[0] if isinstance(index, list) else index
-            found.setdefault(episode, []).append(
-                (frame, np.atleast_1d(np.asarray(action, np.float64)), value)
-            )
-    episodes = []
-    for number in sorted(found):
-        frames = sorted(found[number], key=lambda f: f[0])
-        episodes.append(
-            (np.array([a for _, a, _ in frames]), np.array([i for *_, i in frames], dtype=np.int64))
+    found = read_frames(root, (EXACT_ACTION, SCENARIO_INDEX))
+    return [
+        (
+            found[number][EXACT_ACTION].astype(np.float64, copy=False),
+            found[number][SCENARIO_INDEX][:, 0].astype(np.int64, copy=False),
         )
-    return episodes
+        for number in sorted(found)
+    ]
 
 
 def actions_sha256(actions: np.ndarray) -> str:

@@ -9,17 +9,15 @@ and where a file's header already says it, not even that. LeRobot is not importe
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
+from lerobot_roborecover.datasets.parquet_read import episodes_of
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_INFO_BYTES = 2**24
@@ -85,7 +83,7 @@ def check_frames(root: Path, steps: Sequence[int] | None = None, *, thorough: bo
 def _cameras(root: Path) -> tuple[list[str], float]:
     path = root / "meta" / "info.json"
     try:
-        info = json.loads(read_bytes(root, path, MAX_INFO_BYTES))
+        info = load_json(read_bytes(root, path, MAX_INFO_BYTES))
         cameras = sorted(k for k, f in info["features"].items() if f["dtype"] == "video")
         fps = float(info["fps"])
         if not 0 < fps <= 1000:
@@ -109,10 +107,9 @@ def read_clips(root: Path, cameras: Sequence[str]) -> list[Clip]:
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [f"videos/{camera}/{part}" for camera in cameras for part in parts]
     clips = []
-    for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
+    for path, table in episodes_of(root, ["episode_index", "length", *columns]):
         try:
-            table = pq.read_table(path, columns=["episode_index", "length", *columns]).to_pydict()
-            for row, episode in enumerate(table["episode_index"]):
+            for row, episode in enumerate(table["episode_index"].tolist()):
                 for camera in cameras:
                     chunk, file, start, end = (table[f"videos/{camera}/{part}"][row] for part in parts)
                     name = f"chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
@@ -121,7 +118,7 @@ def read_clips(root: Path, cameras: Sequence[str]) -> list[Clip]:
                     if not (0 <= float(start) <= float(end) < MAX_FILM_S and steps >= 0):
                         raise ValueError(f"episode {episode}: from {start} to {end} s, {steps} steps")
                     clips.append(Clip(int(episode), camera, video, float(start), float(end), steps))
-        except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as err:
+        except (OverflowError, ValueError) as err:
             raise ScenarioError(f"{path} is not LeRobot's ({err!s:.200}); fetch it again") from None
     return clips
 

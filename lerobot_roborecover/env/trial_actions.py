@@ -70,7 +70,8 @@ def read_actions(folder: Path, row: TrialRow) -> np.ndarray:
         return np.zeros((0, 0), np.float32)
     path = actions_path(folder, row)
     try:
-        actions = np.load(path, allow_pickle=False)
+        # Mapped first: a header may claim any size, and is refused where the file has another.
+        actions = np.array(np.lib.format.open_memmap(path, mode="r"))
     except (OSError, ValueError, EOFError) as err:
         raise ScenarioError(
             f"trial {row.trial} of {row.scenario_id} by {row.policy}: its actions cannot be read ({err}). A "

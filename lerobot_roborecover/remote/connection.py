@@ -26,6 +26,7 @@ from lerobot_roborecover.remote.errors import (
     ServerRefusedError,
     SessionGoneError,
     WireError,
+    printable,
 )
 from lerobot_roborecover.remote.protocol import pack, unpack
 from lerobot_roborecover.remote.sessions import SessionLostError
@@ -310,6 +311,8 @@ class RemoteServer:
 def _gist(text: str) -> str:
     """An error text's last line, which is what a traceback is about; all of it goes to the log."""
     if "\n" in text.strip():
-        logger.warning("the server says:\n%s", text[-_SHOWN:])
+        logger.warning(
+            "the server says:\n%s", "\n".join(printable(line) for line in text[-_SHOWN:].splitlines())
+        )
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1][:500] if lines else "(no words)"

@@ -5,8 +5,21 @@ from __future__ import annotations
 from lerobot_roborecover.errors import RoboRecoverError
 
 
+def printable(text: str) -> str:
+    """Returns text of a peer with control characters, which a terminal obeys, written as escapes."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
+
+
 class RemoteError(RoboRecoverError, RuntimeError):
-    """A remote policy cannot be asked, or its answer cannot be used."""
+    """A remote policy cannot be asked, or its answer cannot be used.
+
+    What a peer says reaches the user in such errors: their words are made printable here.
+    """
+
+    def __init__(self, *words: object):
+        super().__init__(*(printable(w) if isinstance(w, str) else w for w in words))
 
 
 class MappingError(RemoteError):

@@ -10,6 +10,23 @@ API_KEY = "ROBORECOVER_API_KEY"
 """Environment variable, on both machines."""
 
 
+MIN_KEY_CHARS = 16
+"""Of a server's key: shorter ones can be found by trying."""
+
+
+def check_key(key: str) -> None:
+    """Checks that a key is long enough for a server that a network reaches.
+
+    Raises:
+        RemoteError: it is too short.
+    """
+    if len(key) < MIN_KEY_CHARS:
+        raise RemoteError(
+            f"{API_KEY} has {len(key)} characters; a server's key has {MIN_KEY_CHARS} or more. Make one: "
+            "openssl rand -hex 16"
+        )
+
+
 def api_key() -> str | None:
     """The key of this process; None where none is set.
 

@@ -20,7 +20,7 @@ from lerobot_roborecover.env.policy_settings import digest_of
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.threads import fit_threads
-from lerobot_roborecover.remote.keys import API_KEY, api_key
+from lerobot_roborecover.remote.keys import API_KEY, api_key, check_key
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.server import PolicyServer, ServeOptions, is_loopback
 
@@ -43,6 +43,10 @@ class ServeConfig:
     """Of a request."""
     max_sessions: int = 256
     """Trials whose history is kept at once."""
+    max_connections: int = 256
+    """Clients connected at once."""
+    max_pending_mb: int = 256
+    """Of requests of all clients that are not answered yet; one frame always fits."""
     certfile: str = ""
     """TLS certificate chain, PEM: clients then say wss:// (--certfile CERT --keyfile KEY)."""
     keyfile: str = ""
@@ -77,12 +81,17 @@ class ServeConfig:
             ("batch_delay_ms", 0, 10_000),
             ("max_frame_mb", 1, 4096),
             ("max_sessions", 1, 10**6),
+            ("max_connections", 1, 10_000),
+            ("max_pending_mb", 1, 2**20),
         ):
             if not low <= getattr(self, name) <= high:
                 raise OptionError(f"--{name}={getattr(self, name)}: must be from {low} to {high}")
         if self.keyfile and not self.certfile:
             raise OptionError(f"--keyfile={self.keyfile}: the key of which certificate? Give --certfile")
-        if api_key() is None and not is_loopback(self.host) and not self.insecure:
+        key = api_key()
+        if key is not None:
+            check_key(key)
+        if key is None and not is_loopback(self.host) and not self.insecure:
             raise OptionError(
                 f"--host={self.host}: whoever reaches this address could use the policy. Set {API_KEY} here "
                 "and at the client; or listen on 127.0.0.1 and use an SSH tunnel; or say --insecure=true"
@@ -146,9 +155,10 @@ def public_name(path: str) -> str:
 def serve(cfg: ServeConfig) -> int:
     """Serves until it is interrupted; see `main`."""
     policy = cfg.check()
+    pending_mb = max(cfg.max_pending_mb, cfg.max_frame_mb)
     options = ServeOptions(
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
-        api_key(), cfg.certfile, cfg.keyfile,
+        cfg.max_connections, pending_mb * 2**20, api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
     facts = facts_of(policy, rename_map=cfg.rename_map)  # before loading fills in anything
     told = digest_of([facts.policy, facts.policy_settings])

@@ -13,6 +13,8 @@ from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.remote.sessions import PROTOCOL, RequestError
 
 _LONGEST_SIDE = 8192
+_MOST_NUMBERS = 3 * 2048 * 2048
+"""Of one array: each becomes a float32, for a moment twice."""
 
 
 class ServedPolicy(PolicyHost):
@@ -85,8 +87,12 @@ class ServedPolicy(PolicyHost):
                 raise RequestError(f"{key!r:.100} is a {type(value).__name__}, not an array")
             if value.dtype == np.uint8 and (value.ndim != 3 or value.shape[2] != 3 or not value.size):
                 raise RequestError(f"{key!r:.100} has shape {value.shape}; a uint8 picture is (H, W, 3)")
-            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4:
-                raise RequestError(f"{key!r:.100} has shape {value.shape}")
+            size = value.size if key in self.expected else 0
+            if max(value.shape, default=1) > _LONGEST_SIDE or value.ndim > 4 or size > _MOST_NUMBERS:
+                raise RequestError(
+                    f"{key!r:.100} has shape {value.shape}; the limits are {_MOST_NUMBERS} numbers, 4 "
+                    f"dimensions and {_LONGEST_SIDE} a side. Make the pictures smaller"
+                )
         pictures = {k for k, f in self.expected.items() if f.type is FeatureType.VISUAL}
         missing = set(self.expected) - set(found)
         # A policy fills in some of its cameras, as it does when it is loaded beside the simulator.
@@ -100,7 +106,8 @@ class ServedPolicy(PolicyHost):
                 raise RequestError(
                     f"{key!r} has shape {found[key].shape}; this policy takes {tuple(feature.shape)}"
                 )
-        return found
+        # What the policy does not take is neither kept nor converted.
+        return {key: found[key] for key in self.expected if key in found}
 
     def _prepare(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:
         keys = observations[0]
@@ -113,7 +120,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
     """As `lerobot.envs.preprocess_observation` makes tensors: pictures (B, 3, H, W) from 0 to 1, all
     float32."""
     if array.dtype == np.uint8:
-        return torch.from_numpy(array).permute(0, 3, 1, 2).contiguous().type(torch.float32) / 255
+        return torch.from_numpy(array).permute(0, 3, 1, 2).contiguous().type(torch.float32).div_(255)
     return torch.from_numpy(array).float()
 
 

@@ -10,20 +10,25 @@ import secrets
 import signal
 import ssl
 import time
+import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from lerobot_roborecover.policies.host import Chunk, PolicyError
-from lerobot_roborecover.remote.errors import RemoteError
+from lerobot_roborecover.remote.errors import RemoteError, printable
+from lerobot_roborecover.remote.limits import ByteBudget, LimitedConnection, WrongKeys
 from lerobot_roborecover.remote.protocol import pack, unpack
 from lerobot_roborecover.remote.served import ServedPolicy
 from lerobot_roborecover.remote.sessions import Envelope, RequestError, Sessions, read_envelope
+from lerobot_roborecover.remote.sockets import OpeningSockets
 from lerobot_roborecover.signals import STOP_SIGNALS
 
 logger = logging.getLogger(__name__)
@@ -39,6 +44,9 @@ class ServeOptions:
     batch_delay_s: float = 0.005
     max_frame_bytes: int = 64 * 2**20
     max_sessions: int = 256
+    max_connections: int = 256
+    max_pending_bytes: int = 256 * 2**20
+    """Of requests that have arrived and are not answered yet, over all connections."""
     api_key: str | None = None
     """Clients must send it; None lets everybody in."""
     certfile: str = ""
@@ -146,7 +154,7 @@ class Batcher:
             columns = zip(*((q.observation, q.instruction, q.history) for q in batch), strict=True)
             answers = await self.call(self._policy.act, *map(list, columns))
         except Exception as err:  # whatever it is, it must not end the server
-            logger.exception("inference failed")
+            logger.error("inference failed:\n%s", _trace(err))
             answers = [PolicyError(f"{type(err).__name__}: {err}")] * len(batch)
         for question, answer in zip(batch, answers, strict=True):
             if not question.answer.done():
@@ -171,6 +179,8 @@ class PolicyServer:
         self._policy, self._options = policy, options
         self._metadata = policy.metadata(name) | ({"identity": identity} if identity else {})
         self._connections = 0
+        self._wrong_keys = WrongKeys()
+        self.budget = ByteBudget(options.max_pending_bytes)
         self.served = 0
         """Inferences answered."""
 
@@ -200,13 +210,18 @@ class PolicyServer:
             stop = asyncio.Event()
             _stop_on_signals(stop)
         inferring = asyncio.create_task(self._batcher.run())
+        self._sockets = OpeningSockets()
         try:
-            async with serve(
-                self._handle, options.host, options.port, compression=None, ping_interval=30, ping_timeout=60,
-                max_size=options.max_frame_bytes, max_queue=4, process_request=self._admit,
-                server_header=None, close_timeout=2, ssl=tls,
-            ) as server:  # fmt: skip
-                ready(server.sockets[0].getsockname()[1])
+            async with AsyncExitStack() as stack:
+                listening = self._sockets.listen(options.host, options.port)
+                for one in listening:
+                    await stack.enter_async_context(serve(
+                        self._handle, sock=one, compression=None, ping_interval=30, ping_timeout=60,
+                        max_size=options.max_frame_bytes, max_queue=4, process_request=self._admit,
+                        server_header=None, close_timeout=2, ssl=tls, logger=_HANDSHAKES,
+                        create_connection=cast(Any, partial(LimitedConnection, budget=self.budget)),
+                    ))  # fmt: skip
+                ready(listening[0].getsockname()[1])
                 await stop.wait()
         except OSError as err:
             raise RemoteError(
@@ -214,10 +229,11 @@ class PolicyServer:
                 "--port"
             ) from err
         finally:
+            self._sockets.close()
             inferring.cancel()
             self._batcher.close()
 
-    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         refusal = self._refusal(request)
         if refusal is not None:
             return connection.respond(*refusal)
@@ -225,9 +241,16 @@ class PolicyServer:
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         key, given = self._options.api_key, request.headers.get_all("Authorization")
         if key is not None and not (
-            len(given) == 1 and secrets.compare_digest(given[0].encode(), f"Api-Key {key}".encode())
+            len(given) == 1
+            and secrets.compare_digest(given[0].encode("utf-8", "surrogateescape"), f"Api-Key {key}".encode())
         ):
+            await asyncio.sleep(self._wrong_keys.note(str(connection.remote_address[0])))
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "wrong or missing API key\n")
+        if self._connections >= self._options.max_connections:
+            logger.warning("refused %s: %d connections", connection.remote_address, self._connections)
+            return connection.respond(
+                http.HTTPStatus.SERVICE_UNAVAILABLE, "as many connections as --max_connections allows\n"
+            )
         return None
 
     def _refusal(self, request: Request) -> tuple[http.HTTPStatus, str] | None:
@@ -241,15 +264,21 @@ class PolicyServer:
         return None
 
     async def _handle(self, socket: ServerConnection) -> None:
+        assert isinstance(socket, LimitedConnection)
+        self._sockets.finished(socket.transport.get_extra_info("socket").fileno())
         own = f"connection {socket.id}"
         logger.info("%s opened the %s", socket.remote_address, own)
         self._connections += 1
         try:
             await socket.send(pack(self._metadata))
             async for message in socket:
-                await socket.send(await self._answer(message, own))
+                socket.begin(message)
+                try:
+                    await socket.send(await self._answer(message, own))
+                finally:
+                    socket.end()
         except ConnectionClosed as err:
-            logger.info("%s lost: %s", own, err)
+            logger.info("%s lost: %s", own, printable(str(err)))
         finally:
             self._connections -= 1
             await self._sessions.end(own)
@@ -275,7 +304,7 @@ class PolicyServer:
             logger.warning("%s: %s", own, err)
             return f"{type(err).__name__}: {err}"
         except Exception as err:  # a client's message must not end the server
-            logger.exception("request failed")
+            logger.error("request failed:\n%s", _trace(err))
             return f"internal error: {type(err).__name__}"
 
     async def _infer(self, content: dict, envelope: Envelope) -> bytes:
@@ -304,6 +333,27 @@ class PolicyServer:
         if envelope.end:
             await self._sessions.end(envelope.session)
         return session.last
+
+
+class _OneLine(logging.Filter):
+    """Takes tracebacks off: a handshake that fails is the client's affair."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Shortens a record, and lowers what is no fault of the server."""
+        if record.exc_info and record.exc_info[1] is not None:
+            err = record.exc_info[1]
+            record.msg, record.args = f"{record.getMessage()}: {printable(str(err))[:200]}", ()
+            record.exc_info = None
+        return True
+
+
+_HANDSHAKES = logging.getLogger(f"{__name__}.websockets")
+_HANDSHAKES.addFilter(_OneLine())
+
+
+def _trace(err: Exception) -> str:
+    """A traceback whose lines may hold a client's words."""
+    return "\n".join(printable(line) for line in "".join(traceback.format_exception(err)).splitlines())
 
 
 def _bare(host: str) -> str:

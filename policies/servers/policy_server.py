@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hmac
 import http
+import inspect
 import os
 import re
+import sys
 import threading
 import time
 import traceback
@@ -24,6 +26,12 @@ DTYPE = re.compile(r"[<>|=]?([biu][1248]|f[248])|bool|u?int(8|16|32|64)|float(16
 API_KEY = "ROBORECOVER_API_KEY"
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 LIMITS = {"max_array_len": 4096, "max_map_len": 4096, "max_str_len": 2**20, "max_ext_len": 0}
+MOST_VALUES = 65536
+"""Values of all lists and maps of a request: a byte on the wire may be sixty in memory. An array is one."""
+MIN_KEY_CHARS = 16
+MAX_CONNECTIONS = 16
+"""At once; each may hold a frame or two."""
+WRONG_KEY_DELAY_S = 1.0
 
 
 def encode(value):
@@ -51,6 +59,34 @@ def decode(value):
     return np.frombuffer(value[b"data"], dtype).reshape(value[b"shape"]).copy()
 
 
+def unpack(message):
+    """Returns the request of a frame; raises ValueError where it holds more values than any request."""
+    left = [MOST_VALUES]
+
+    def count(values):
+        left[0] -= values
+        if left[0] < 0:
+            raise ValueError(f"more than {MOST_VALUES} values in lists and maps; send numbers as arrays")
+
+    def read_map(content):
+        count(2 * len(content) + 1)
+        return decode(content)
+
+    def read_list(content):
+        count(len(content) + 1)
+        return content
+
+    return msgpack.unpackb(message, object_hook=read_map, list_hook=read_list, **LIMITS)
+
+
+def printable(text):
+    """Returns text of a client with control characters, which a terminal obeys, written as escapes."""
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in text
+    )
+
+
 def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, started=None, insecure=False):
     """Serves for ever.
 
@@ -66,10 +102,16 @@ def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, st
         started: called with the server, if given.
         insecure: listen beyond the loopback without a key.
     """
-    one_at_a_time = threading.Lock()
+    one_at_a_time, slow, wrong_keys = threading.Lock(), threading.Lock(), [0]
+    free = threading.BoundedSemaphore(MAX_CONNECTIONS)
     key = os.environ.get(API_KEY)
     if key is not None and not key.strip():
         raise SystemExit(f"{API_KEY} is set and empty: give it a value, or unset it")
+    if key is not None and len(key) < MIN_KEY_CHARS:
+        raise SystemExit(
+            f"{API_KEY} has {len(key)} characters; a server's key has {MIN_KEY_CHARS} or more. Make one: "
+            "openssl rand -hex 16"
+        )
     if key is None and host not in LOOPBACK and not insecure:
         raise SystemExit(
             f"host {host}: whoever reaches this address could use the policy. Set {API_KEY} here and at the "
@@ -83,8 +125,15 @@ def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, st
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         given = request.headers.get_all("Authorization")
         if key is not None and not (
-            len(given) == 1 and hmac.compare_digest(given[0].encode(), f"Api-Key {key}".encode())
+            len(given) == 1
+            and hmac.compare_digest(given[0].encode("utf-8", "surrogateescape"), f"Api-Key {key}".encode())
         ):
+            with slow:  # wrong keys wait for each other
+                wrong_keys[0] += 1
+                if wrong_keys[0] & (wrong_keys[0] - 1) == 0:
+                    peer = connection.remote_address[0]
+                    print(f"wrong or missing API key from {peer}; {wrong_keys[0]} so far", flush=True)
+                time.sleep(WRONG_KEY_DELAY_S)
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "wrong or missing API key\n")
         return None
 
@@ -92,26 +141,34 @@ def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, st
         try:
             if isinstance(message, str):
                 raise ValueError("a text frame; requests are binary")
-            request = msgpack.unpackb(message, object_hook=decode, **LIMITS)
             with one_at_a_time:
+                request = unpack(message)
                 began = time.monotonic()
                 result = dict(infer(request))
             result["server_timing"] = {"infer_ms": 1000 * (time.monotonic() - began)}
             return msgpack.packb(result, default=encode)
         except Exception as error:  # an error belongs to its request; where it was is for this side to read
-            traceback.print_exc()
+            print(printable(traceback.format_exc()), file=sys.stderr, flush=True)
             return f"{type(error).__name__}: {error}"
 
     def handle(connection):
+        if not free.acquire(blocking=False):
+            connection.close(1013, f"{MAX_CONNECTIONS} connections are all that are taken")
+            return
         try:
             connection.send(msgpack.packb(metadata or {}, default=encode))
             for message in connection:
                 connection.send(answer(message))
         except ConnectionClosed:
             pass
+        finally:
+            free.release()
 
     size = max_frame_mb * 2**20
-    with listen(handle, host, port, compression=None, max_size=size, process_request=admit) as server:
+    options = {"compression": None, "max_size": size, "process_request": admit}
+    if "max_queue" in inspect.signature(listen).parameters:  # websockets 13 keeps one message anyway
+        options["max_queue"] = 2
+    with listen(handle, host, port, **options) as server:
         print(f"serving at ws://{host}:{server.socket.getsockname()[1]}", flush=True)
         if started is not None:
             started(server)

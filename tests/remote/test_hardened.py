@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import shutil
 import ssl
-import subprocess
 import sys
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +28,7 @@ from tests.support.serve_loop import (  # noqa: F401 - fixtures
     checkpoints,
     load,
 )
+from tests.support.tls import certificate
 
 pytestmark = pytest.mark.lerobot
 SLACK_BYTES = 64 * 2**20
@@ -177,21 +176,14 @@ def test_clients_learn_no_path(checkpoints):  # noqa: F811
 
 
 def test_traffic_over_tls(tmp_path, monkeypatch):
-    if shutil.which("openssl") is None:
-        pytest.skip("no openssl: apt-get install openssl")
-    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost",
-         "-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost", "-keyout", key, "-out", cert],
-        check=True, capture_output=True,
-    )  # fmt: skip
+    cert, key = certificate(tmp_path)
     from tests.support.policy_servers import ask as ask_server
 
-    with serving(Cameras(), certfile=str(cert), keyfile=str(key)) as (url, _):
+    with serving(Cameras(), certfile=cert, keyfile=key) as (url, _):
         secure = url.replace("ws://", "wss://")
         (unknown,) = ask_server(secure, {"observation.images.a": picture(1)})
         assert "certificate" in str(unknown).lower()
-        monkeypatch.setenv("SSL_CERT_FILE", str(cert))
+        monkeypatch.setenv("SSL_CERT_FILE", cert)
         (answer,) = ask_server(secure, {"observation.images.a": picture(1)})
         np.testing.assert_array_equal(answer["actions"], [[48, 1]])
         with connect_tls(secure, cert) as client:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-import threading
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -14,13 +13,11 @@ import pytest
 from lerobot_roborecover.remote.errors import (
     MappingError,
     RemoteError,
-    ServerRefusedError,
     WireError,
 )
 from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
 from lerobot_roborecover.remote.translate import Translator, quat_xyzw, resize
-from tests.support.policy_servers import ask, openpi_client  # noqa: F401 - a fixture
-from tests.support.processes import PATIENCE_S
+from tests.support.policy_servers import ask, openpi_client, standalone  # noqa: F401 - fixtures
 
 SERVERS = Path(__file__).parents[2] / "policies" / "servers"
 
@@ -235,70 +232,6 @@ def test_scale_offset_and_horizon():
 # --- the servers for environments of their own
 
 
-@pytest.fixture
-def standalone(monkeypatch):
-    """The modules of `policies/servers`, and a way to run one."""
-    monkeypatch.syspath_prepend(str(SERVERS))
-    module = importlib.import_module("policy_server")
-
-    def run(infer, **options):
-        up, found = threading.Event(), []
-
-        def started(server):
-            found.append(server)
-            up.set()
-
-        arguments = {"metadata": {"policy": "p"}, "port": 0, "started": started, **options}
-        threading.Thread(target=module.serve, args=(infer,), kwargs=arguments, daemon=True).start()
-        assert up.wait(PATIENCE_S)
-        servers.append(found[0])
-        return f"ws://127.0.0.1:{found[0].socket.getsockname()[1]}"
-
-    servers = []
-    yield run
-    for server in servers:
-        server.shutdown()
-
-
-def test_the_standalone_server_speaks_to_both_clients(standalone, openpi_client):  # noqa: F811
-    from openpi_client.websocket_client_policy import WebsocketClientPolicy
-
-    url = standalone(lambda request: {"actions": request["state"][None] * 2})
-    theirs = WebsocketClientPolicy(url)
-    assert theirs.get_server_metadata() == {"policy": "p"}
-    np.testing.assert_array_equal(theirs.infer({"state": np.ones(3)})["actions"], [[2, 2, 2]])
-    with pytest.raises(RuntimeError, match="KeyError") as refused:
-        theirs.infer({"stat": 1})
-    assert "Traceback (most recent call last)" not in str(refused.value)
-    good, bad, objects = ask(url, {"state": np.ones(3)}, {"stat": 1}, {"state": b"\x80"})
-    np.testing.assert_array_equal(good["actions"], [[2, 2, 2]])
-    assert "KeyError: 'state'" in str(bad)
-    assert isinstance(objects, ServerRefusedError)
-
-
-def test_the_standalone_server_keeps_strangers_out(standalone, openpi_client, monkeypatch):  # noqa: F811
-    import websockets.sync.client
-    from openpi_client.websocket_client_policy import WebsocketClientPolicy
-
-    monkeypatch.setenv("ROBORECOVER_API_KEY", "secret")
-    url = standalone(lambda request: {"actions": request["state"][None]})
-    for headers in ({}, {"Authorization": "Api-Key x"}, {"Origin": "https://example.org"}):
-        with pytest.raises(websockets.exceptions.InvalidStatus):
-            websockets.sync.client.connect(url, additional_headers=headers)
-    np.testing.assert_array_equal(
-        ask(url, {"state": np.ones(3)}, api_key="secret")[0]["actions"], [[1, 1, 1]]
-    )
-    theirs = WebsocketClientPolicy(url, api_key="secret")
-    np.testing.assert_array_equal(theirs.infer({"state": np.ones(3)})["actions"], [[1, 1, 1]])
-    module = importlib.import_module("policy_server")
-    monkeypatch.setenv("ROBORECOVER_API_KEY", "")
-    with pytest.raises(SystemExit, match="set and empty"):
-        module.serve(lambda request: {})
-    monkeypatch.delenv("ROBORECOVER_API_KEY")
-    with pytest.raises(SystemExit, match="could use the policy"):
-        module.serve(lambda request: {}, host="0.0.0.0")
-
-
 def modules(monkeypatch, **names):
     """Stand-ins for modules of a family's repository."""
     for path, content in names.items():
@@ -397,7 +330,7 @@ def cosmos(monkeypatch, seen):
         ("cosmos_policy", "cosmos_policy_libero", cosmos, 16),
     ],
 )
-def test_mapping_and_server_of_a_family_fit(standalone, monkeypatch, name, module, family, steps):
+def test_mapping_and_server_of_a_family_fit(standalone, monkeypatch, name, module, family, steps):  # noqa: F811
     """Our two halves, around a stand-in for the family's own code."""
     seen = []
     arguments = family(monkeypatch, seen)

@@ -110,6 +110,31 @@ def serving(policy: Any, **options: Any) -> Iterator[tuple[str, Any]]:
         loop.close()
 
 
+@pytest.fixture
+def standalone(monkeypatch):
+    """The modules of `policies/servers`, and a way to run one."""
+    monkeypatch.syspath_prepend(str(ROOT / "policies" / "servers"))
+    module = importlib.import_module("policy_server")
+
+    def run(infer, **options):
+        up, found = threading.Event(), []
+
+        def started(server):
+            found.append(server)
+            up.set()
+
+        arguments = {"metadata": {"policy": "p"}, "port": 0, "started": started, **options}
+        threading.Thread(target=module.serve, args=(infer,), kwargs=arguments, daemon=True).start()
+        assert up.wait(PATIENCE_S)
+        servers.append(found[0])
+        return f"ws://127.0.0.1:{found[0].socket.getsockname()[1]}"
+
+    servers = []
+    yield run
+    for server in servers:
+        server.shutdown()
+
+
 @pytest.fixture(scope="session")
 def openpi_client(tmp_path_factory) -> Any:
     """The real `openpi_client`.

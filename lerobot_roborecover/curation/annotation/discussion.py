@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import Vote
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import write_whole
 
@@ -63,7 +63,7 @@ def read_discussion(path: Path) -> Discussion:
         ScenarioError: it is not one.
     """
     try:
-        found = json.loads(read_bytes(path.parent, path, MAX_BYTES))
+        found = load_json(read_bytes(path.parent, path, MAX_BYTES))
         if found["schema"] != SCHEMA_VERSION or type(found["round"]) is not int:
             raise ValueError(f"schema {found['schema']!r:.40}")
         if not 2 <= found["round"] <= MAX_ROUNDS:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import struct
 import threading
 from collections import OrderedDict, deque
@@ -18,10 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
+from lerobot_roborecover.datasets.parquet_read import episodes_of
 from lerobot_roborecover.scenario import ScenarioError
 
 PACK = 32
@@ -58,7 +56,7 @@ class Videos:
         self.root = root
         path = root / "meta" / "info.json"
         try:
-            info = json.loads(read_bytes(root, path, MAX_INFO_BYTES))
+            info = load_json(read_bytes(root, path, MAX_INFO_BYTES))
             self.fps = float(info["fps"])
             self.cameras = sorted(k for k, f in info["features"].items() if f["dtype"] == "video")
             if not 0 < self.fps <= 1000:
@@ -81,17 +79,16 @@ class Videos:
         parts = ("chunk_index", "file_index", "from_timestamp")
         columns = [f"videos/{camera}/{part}" for camera in self.cameras for part in parts]
         clips = {}
-        for path in sorted((self.root / "meta" / "episodes").rglob("*.parquet")):
+        for path, table in episodes_of(self.root, ["episode_index", *columns]):
             try:
-                table = pq.read_table(path, columns=["episode_index", *columns]).to_pydict()
-                for row, episode in enumerate(table["episode_index"]):
+                for row, episode in enumerate(table["episode_index"].tolist()):
                     for camera in self.cameras:
                         chunk, file, start = (table[f"videos/{camera}/{part}"][row] for part in parts)
                         name = f"chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
                         clips[camera, int(episode)] = EpisodeSpan(
                             self.root / "videos" / camera / name, float(start)
                         )
-            except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as err:
+            except (OverflowError, ValueError) as err:
                 raise ScenarioError(f"{path} is not LeRobot's ({err!s:.200}); fetch it again") from None
         return clips
 

@@ -11,7 +11,6 @@ replay gives the very frames of the original (SSIM 1).
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.curation.annotation.frames import MAX_INFO_BYTES, Videos
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import load_json, read_bytes
 from lerobot_roborecover.datasets.frames import KEPT
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -64,7 +63,7 @@ def read_encoders(root: Path) -> dict[str, Encoder]:
     from lerobot.configs.video import encoder_config_from_video_info
 
     path = root / "meta" / "info.json"
-    info = json.loads(read_bytes(root, path, MAX_INFO_BYTES))
+    info = load_json(read_bytes(root, path, MAX_INFO_BYTES))
     found = {}
     for camera, feature in info["features"].items():
         if feature["dtype"] != "video":
