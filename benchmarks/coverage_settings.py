@@ -155,7 +155,7 @@ def with_tasks(replicates: int) -> Iterator[Line]:
 
 
 def macro(replicates: int) -> Iterator[Line]:
-    """Macro over up to nine cells of unlike size and rate; and where the smallest one is unlike the others."""
+    """Macro over up to nine cells of unlike size and rate, and with a smallest one unlike the others."""
     for n in SIZES:
         cell = cells_of(n)
         labels = np.unique(cell)
@@ -329,7 +329,7 @@ def chosen(replicates: int) -> Iterator[Line]:
             found: dict[str, list] = {}
             for _ in range(count):
                 y = rng.binomial(k, scenario_rates(rng, np.array(p)[:, None], n, scatter, POLICIES))
-                panel = _panel(y, k)
+                panel = panel_of(y, k)
                 others = list(range(1, POLICIES))
                 gain = gain_over(panel.successes, panel.trials, 0, others, draws)
                 found.setdefault("source gain", []).append(gain)
@@ -344,13 +344,14 @@ def chosen(replicates: int) -> Iterator[Line]:
                 yield held(f"{what}, cross-fitted", n, setting, bounds, truth)
 
 
-def _panel(successes: np.ndarray, trials: int) -> Panel:
+def panel_of(successes: np.ndarray, trials: int | np.ndarray) -> Panel:
+    """A panel of (policies, scenarios) successes; trials of every scenario, or of each."""
     labels = [
         ScenarioLabels(f"s{i:03d}", "libero", "", "", "", "", "", "", "", 300)
         for i in range(successes.shape[1])
     ]
-    full = np.full(successes.shape, trials)
-    return Panel(tuple("abcdef"), tuple(labels), successes, full, np.zeros_like(full), {})
+    full = np.broadcast_to(trials, successes.shape)
+    return Panel(tuple("abcdef"[: len(successes)]), tuple(labels), successes, full, np.zeros_like(full), {})
 
 
 ORDERS = {

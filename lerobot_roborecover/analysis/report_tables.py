@@ -80,8 +80,8 @@ def overall(results: Results) -> Table:
     rows = [
         (
             policy, initial[p], rsr[p], *(found[p] for found in macro.values()), retention[p],
-            int((panel.trials[p] > 0).sum()), int(panel.trials[p].sum()), int(panel.invalid[p].sum()), float(valid[p]),
-            tasks[p], paper[p], paper_macro[p],
+            int((panel.trials[p] > 0).sum()), int(panel.trials[p].sum()), int(panel.invalid[p].sum()),
+            float(valid[p]), tasks[p], paper[p], paper_macro[p],
         )
         for p, policy in enumerate(panel.arms)
     ]  # fmt: skip

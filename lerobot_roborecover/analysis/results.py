@@ -26,6 +26,7 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
@@ -51,6 +52,8 @@ class Options:
     """Rank all policies, on the scenarios common to all; by default those that are complete."""
     sequential: bool = False
     """Whether all pairs are tested so that the logs may be looked at while they grow."""
+    planned: Mapping[str, str] | None = None
+    """Units of the planned scenarios by id, for that; by default those that the rows name."""
 
     def __post_init__(self):
         if self.draws < 100:
@@ -178,16 +181,25 @@ class Results:
         for indices in (pair, (pair[1], pair[0])):
             record = self._records.get((panel.arms[indices[0]], panel.arms[indices[1]]))
             if record is not None:
-                found = watched_pair(
-                    panel, indices, level,
-                    scenarios=record.scenarios, trials=record.trials, planned_level=record.level,
-                )  # fmt: skip
+                check_plan(record, self.options.planned)
+                found = watched_pair(panel, indices, level, recorded_plan(record, panel), record.level)
                 return found if indices == pair else found.turned()
-        return watched_pair(panel, pair, level) if self.options.sequential else None
+        if not self.options.sequential:
+            return None
+        return watched_pair(panel, pair, level, self.sequential_plan(pair))
+
+    def sequential_plan(self, pair: tuple[int, int]) -> SequentialPlan:
+        """What the comparison of two policies of the recovery panel was to be over, by their rows."""
+        o = self.options
+        return plan_of(self.recovery, pair, self._direct, o.planned, o.scheduled)
 
     @cached_property
     def _records(self) -> Mapping[tuple[str, str], SequentialRecord]:
         return recorded_pairs(self.study.sequential, self._direct)
+
+    def record_of(self, a: str, b: str) -> SequentialRecord | None:
+        """The record that keeps the plan of two policies' comparison, in either order."""
+        return self._records.get((a, b)) or self._records.get((b, a))
 
     @cached_property
     def runs(self) -> tuple[RunRates, ...]:
