@@ -29,6 +29,7 @@ from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
@@ -294,7 +295,10 @@ def _board(
     behind = [_undefined()] * len(arms)
     if best is not None:
         behind = draws.differences((panel.rates[best] - panel.rates).T)
-    found = contrasts(panel.rates, panel.arms, draws, list(combinations(ranked, 2)), unit=WORDS[unit])
+    found = contrasts(
+        panel.rates, panel.arms, draws, list(combinations(ranked, 2)), unit=WORDS[unit],
+        barred=barred_arms(panel),
+    )  # fmt: skip
     between = dict(zip(combinations(ranked, 2), found, strict=True))
     entries = []
     for p, (e, rows) in enumerate(usable.items()):

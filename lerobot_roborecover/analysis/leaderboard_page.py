@@ -94,6 +94,8 @@ def _standing(entry: Entry, rank: str) -> str:
         return "best"
     if separated(entry):
         return "behind the best"
+    if entry.verdict in (ComparisonVerdict.COUNTS_DEPEND, ComparisonVerdict.NO_VALID_TRIAL):
+        return entry.verdict.value
     return (
         "no verdict: too few differ"
         if entry.verdict is ComparisonVerdict.TOO_FEW

@@ -170,7 +170,9 @@ def paired_contrasts(results: Results) -> Table:
     notes = (
         "Percentage points, over the scenarios that both were run on. Intervals are not adjusted; p (Holm) "
         f"is, for the {family} pairs of complete policies. p: paired sign-flip permutation test over "
-        f"{results.unit}.",
+        f"{results.unit}. It tests whether their differences are as likely to have either sign, not whether "
+        "their mean is zero: a policy that is much better on few and a little worse on many can be told "
+        "apart from one with the same RSR.",
         f"Verdict: p (Holm) below {1 - level:.3g}, and at least {LEAST_DIFFERING} {results.unit} on which "
         "the two differ; incomplete policies have none.",
         *_watched_note(results),
@@ -396,7 +398,8 @@ def interventions(results: Results) -> Table:
         "Matched trials share scenario and trial index. Rescued: direct control fails, the "
         "intervention solves. "
         "Harmed: direct control solves, the intervention loses. p (Holm): for the interventions of this "
-        "table, each against its direct control.",
+        "table, each against its direct control. p: sign flips, which test whether differences are as likely "
+        "to have either sign, not whether their mean is zero.",
     )
     return Table("interventions", "Interventions against direct control", columns, tuple(rows), notes)
 

@@ -28,7 +28,9 @@ from lerobot_roborecover.analysis.runs import (
 )
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
+from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
 
@@ -146,6 +148,11 @@ class Results:
         return self.resample(self.recovery, ResamplingUnit.TASK)
 
     @cached_property
+    def barred(self) -> Mapping[str, ComparisonVerdict]:
+        """Policies that no verdict can rest on, and why."""
+        return barred_arms(self.recovery)
+
+    @cached_property
     def contrasts(self) -> tuple[Contrast, ...]:
         """All pairs of policies. Those of ranked ones are one family, on the ranked scenarios."""
         chosen, count = self.compared.policies, len(self.recovery.arms)
@@ -153,7 +160,9 @@ class Results:
             (chosen[k], chosen[m]): c
             for (k, m), c in zip(
                 combinations(range(len(chosen)), 2),
-                contrasts(self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit),
+                contrasts(
+                    self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit, barred=self.barred
+                ),
                 strict=True,
             )
         }
@@ -169,6 +178,7 @@ class Results:
                     outside,
                     unit=self.unit,
                     complete=False,
+                    barred=self.barred,
                 ),
                 strict=True,
             )
@@ -248,7 +258,15 @@ class Results:
             for some, ok in ((inside, True), (outside, False))
             for pair, c in zip(
                 some,
-                contrasts(panel.rates, panel.arms, draws, some, unit=self.unit, complete=ok),
+                contrasts(
+                    panel.rates,
+                    panel.arms,
+                    draws,
+                    some,
+                    unit=self.unit,
+                    complete=ok,
+                    barred=barred_arms(panel),
+                ),
                 strict=True,
             )
         }
@@ -292,6 +310,8 @@ class Results:
         both = np.isfinite(self.initial_rates) & np.isfinite(self.recovery.rates)
         keep = np.zeros(both.shape, bool)
         keep[np.ix_(self.compared.policies, self.compared.scenarios)] = True
+        initial = {} if self.initial is None else barred_arms(self.initial)
+        keep[[p for p, arm in enumerate(self.recovery.arms) if arm in self.barred or arm in initial]] = False
         return compared(both & keep, self.recovery.arms)
 
     @property
@@ -359,6 +379,12 @@ def analyse(study: Study, options: Options | None = None) -> Results:
     panel = make_panel(direct, options.scheduled)
     if words := _compared(panel, direct, options).words:
         remarks.append(words)
+    remarks += [
+        f"{name}: its trial counts go with its outcomes (more trials where the first ones failed, or fewer), "
+        "so its rate is biased and has no verdict. Evaluate every scenario the same number of times"
+        for name, why in barred_arms(panel).items()
+        if why is ComparisonVerdict.COUNTS_DEPEND
+    ]
     if options.common and not (panel.trials > 0).all(0).any():
         raise RowsError("--common: no scenario was run by all policies")
     return Results(
