@@ -223,9 +223,7 @@ def profiles(results: Results) -> Table:
         "zero. By chance alone: what that would be were the two alike (mean, and what 95 % of random deals "
         "of the trials show).",
         *(
-            (
-                f"Only {panel.arms[0]} against every other policy: all pairs would be {len(results.contrasts)}.",
-            )
+            (f"Only {panel.arms[0]} against every other policy, of {len(results.contrasts)} pairs.",)
             if len(rows) < len(results.contrasts)
             else ()
         ),

@@ -35,7 +35,7 @@ from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
 
 MOST_PAIRS = 120
-"""Pairs of policies that a figure still shows, those of 16: the 7,140 of 120 policies took 209 s and 3.1 GB."""
+"""Pairs of policies that a figure shows, those of 16. The 7,140 of 120 policies took 209 s and 3.1 GB."""
 
 
 @dataclass(frozen=True)
