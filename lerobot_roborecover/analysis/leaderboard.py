@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.arms import Arm, arm_of, stopped
 from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.logs import clock_of
@@ -31,7 +32,7 @@ from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
 
@@ -151,20 +152,27 @@ def make_leaderboard(
     groups: dict[tuple, dict[tuple, dict[tuple, tuple[TrialRow, str]]]] = {}
     contradicted: dict[tuple, str] = {}
     logs: dict[tuple, dict[str, None]] = {}
+    read: list[ReadLog] = []
+    digests: list[tuple[str, str]] = []
+    """Name and hash of the file of every log in `read`."""
     for path in files:
         name = str(path.relative_to(folder))
         try:
-            rows = read_trial_log(path)
+            log = read_log(path)
             if (record := read_record(path)) is not None:
                 records.append(record)
             digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         except (TrialLogError, OSError) as err:
             refused.append((name, str(err)))
             continue
-        if not rows:
+        if not log.rows:
             refused.append((name, "it holds no complete row"))
-        method, run = run_of_file.get(path, ("", ""))
-        for row in rows:
+        read.append(log)
+        digests.append((name, digest))
+    read, _ = with_first_states(read)
+    for log, (name, digest) in zip(read, digests, strict=True):
+        method, run = run_of_file.get(log.path, ("", ""))
+        for row in log.rows:
             run_of[id(row)] = run
             key = _board_key(row), _entry_key(row, method)
             other, first = (
@@ -354,7 +362,7 @@ def _arm(entry: tuple, rows: Sequence[TrialRow], start: Start, run_of: dict[int,
 
 
 def _initial(arm: Arm, options: Options) -> Estimate:
-    panel = make_panel([arm])
+    panel = make_panel([arm]).by_first_state()
     draws = resample(panel.units(options.cluster), options.draws, options.seed, options.level)
     return draws.rates(panel.rates.T)[0]
 

@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis.arms import (
     stopped,
 )
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
@@ -86,12 +87,11 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     run_of: dict[int, int] = {}
     """By the identity of a row; of rows that are of no run, or of the first, nothing is said."""
     twice = 0
-    found: list[ReadLog] = []
     runs: dict[str, dict[int, str]] = {}
     records: list[SequentialRecord] = []
-    for name, run, path in _files(logs):
-        log = read_log(path, name or None)
-        found.append(log)
+    files = list(_files(logs))
+    found, unknown = with_first_states([read_log(path, name or None) for name, _, path in files])
+    for (name, run, path), log in zip(files, found, strict=True):
         if run is not None:
             runs.setdefault(name, {}).setdefault(run, _run_name(path))
         if (record := read_record(path)) is not None:
@@ -120,6 +120,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
                     f"{other.outcome!r} after {other.steps} in {_place(other, found)}. "
                     "Give the runs names (NAME=LOG), or leave one out"
                 )
+    remarks += unknown
     if twice:
         remarks.append(f"{twice} row(s) occur in more than one log with the same result; each counts once")
     kept = [row for row in rows.values() if platform is None or row.platform == platform]

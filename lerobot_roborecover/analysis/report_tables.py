@@ -73,7 +73,7 @@ def overall(results: Results) -> Table:
     paper."""
     panel, draws = results.recovery, results.draws
     rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
-    retention = draws.ratios(panel.rates.T, results.initial_rates.T)
+    retention = results.retention
     initial = initial_estimates(results)
     valid = masked_mean(panel.valid_rates.T)
     tasks = rsr if results.tasks is None else results.tasks.rates(panel.rates.T)

@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_roborecover.analysis.estimators import (
     RowsError,
     ScenarioRates,
+    initial_rate_units,
     invalid_counts,
     scenario_rates,
 )
@@ -50,6 +51,7 @@ class StartSummary:
     scenarios: int
     trials: int
     rsr: Estimate
+    """Of initial-state trials: first states weigh the same, and are the units of the interval."""
     macro: Estimate
     invalid: Mapping[str, int]
     """Trials by invalid outcome; they count as failures in the rates."""
@@ -57,6 +59,8 @@ class StartSummary:
     """RSR without the trials that a simulator or a machine ended; None where there are none."""
     cells: tuple[CellSummary, ...]
     """Occupied cells, in the order of the paper's stages and types."""
+    first_states: int
+    """Of the scenarios."""
 
 
 @dataclass(frozen=True)
@@ -96,20 +100,26 @@ def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None
         start=start,
         scenarios=len(scenarios),
         trials=int(scenarios.trials.sum()),
-        rsr=rate_estimate(scenarios.rates, scenarios.units),
+        rsr=_rate_of(start, scenarios),
         macro=rate_estimate(scenarios.rates, scenarios.units, scenarios.cells),
         invalid=invalid_counts(rows),
-        without_infrastructure=_without_infrastructure(rows),
+        without_infrastructure=_without_infrastructure(start, rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
+        first_states=len(set(scenarios.first_states)),
     )
 
 
-def _without_infrastructure(rows: Sequence[Mapping[str, Any]]) -> Estimate | None:
+def _rate_of(start: Start, scenarios: ScenarioRates) -> Estimate:
+    if start is Start.INITIAL:
+        return rate_estimate(*initial_rate_units(scenarios))
+    return rate_estimate(scenarios.rates, scenarios.units)
+
+
+def _without_infrastructure(start: Start, rows: Sequence[Mapping[str, Any]]) -> Estimate | None:
     left = [r for r in rows if not Outcome(r["outcome"]).infrastructure]
     if len(left) == len(rows) or not left:
         return None
-    scenarios = scenario_rates(left)
-    return rate_estimate(scenarios.rates, scenarios.units)
+    return _rate_of(start, scenario_rates(left))
 
 
 def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
@@ -162,6 +172,12 @@ def format_table(summary: Summary) -> str:
             lines.append(f"{name:<26}{_rate(cell.estimate)}{cell.scenarios:>10}{cell.trials:>8}")
         if any(cell.underpowered for cell in recovery.cells):
             lines.append(f"* fewer than {UNDERPOWERED_BELOW} scenarios: neither rate nor interval says much")
+    initial = summary.starts.get(Start.INITIAL)
+    if initial is not None and initial.first_states < initial.scenarios:
+        lines.append(
+            f"\nThe {initial.scenarios} scenarios branch off from {initial.first_states} first states: these "
+            "are what the initial-state rate is over"
+        )
     for start, part in summary.starts.items():
         if part.invalid:
             reasons = ", ".join(f"{count} {name}" for name, count in part.invalid.items())
