@@ -200,7 +200,9 @@ def test_profile_difference_by_hand():
 
 def agreement(initial, recovery, names, units):
     """Of policies whose scenarios have a first state each."""
-    return rank_agreement(*(StartRates(tuple(names), rates, resample(units)) for rates in (initial, recovery)))
+    return rank_agreement(
+        *(StartRates(tuple(names), rates, resample(units)) for rates in (initial, recovery))
+    )
 
 
 def test_rank_bounds_follow_from_what_is_separated_from_both_starts():
