@@ -51,7 +51,7 @@ def test_gains_by_hand():
 
 
 def test_forks_of_one_first_state_are_one_unit():
-    """Initial-state trials of scenarios that share a first state are the same trial, and so are their forks."""
+    """Scenarios that share a first state have the same initial-state trial, and its forks are the same."""
     rows = [
         fork(s, arm, arm == "fresh", start="initial", first_state=f"{s % 3:064x}")
         for s in range(12)
