@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from lerobot_roborecover.datasets.hub import cached_folder
 from lerobot_roborecover.datasets.load import HUB_ID, builtin_names, load_scenarios
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.env.trial_log import ReadLog
@@ -72,7 +71,11 @@ def _of_set(dataset: str, revision: str | None) -> _Found:
 def _scenarios(dataset: str, revision: str | None) -> Iterable[Scenario]:
     if dataset in builtin_names() or Path(dataset).is_dir():
         return load_scenarios(dataset)
-    folder = cached_folder(dataset, revision) if HUB_ID.fullmatch(dataset) else None
+    if not HUB_ID.fullmatch(dataset):
+        return []
+    from lerobot_roborecover.datasets.hub import cached_folder  # an HTTP client is slow to import
+
+    folder = cached_folder(dataset, revision)
     return [] if folder is None else read_with_manifest(folder)[0]
 
 
