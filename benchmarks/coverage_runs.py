@@ -26,7 +26,9 @@ from lerobot_roborecover.analysis.runs import (
     hierarchical_bootstrap,
 )
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, LEAST_RUNS
+from lerobot_roborecover.analysis.watched import watched_pair
 
 RUNS = (2, 3, 5, 10)
 BETWEEN = (0.0, 0.3, 0.8)
@@ -105,6 +107,8 @@ def looks(replicates: int) -> Iterator[Line]:
                     if k == 1 and name == "equal":
                         peeked = _peeked(a - b)
                         yield Line("a fixed test at every look", n, setting, peeked, np.nan, count, True)
+                    if n >= 2 * LOOKS and name == "equal":
+                        yield from _growing(a, b, n, k, setting)
             for p in ((0.02, 0.02), (0.02, 0.1), (0.3, 0.7), (0.5, 0.9)):
                 rng, setting = rng_of("looks, apart", n, k, p), f"{k} trials, beta 4, rates {p[0]} and {p[1]}"
                 a, b = (rng.binomial(k, t) for t in alike(rng, p, n, 4.0, count // 2))
@@ -120,6 +124,32 @@ def looks(replicates: int) -> Iterator[Line]:
                     rate.add(float(value))
                 found.append((rate.estimate.low, rate.estimate.high))
             yield held("rate, confidence sequence", n, f"1 trial, rate {p}", np.array(found).T, p)
+
+
+LOOKS = 10
+
+
+def _growing(a: np.ndarray, b: np.ndarray, n: int, k: int, setting: str) -> Iterator[Line]:
+    """Ten looks at two logs that both grow in the order of the set, planned beforehand, or for what is
+    there."""
+    names = [f"s{i:03d}" for i in range(n)]
+    planned, grown = [], []
+    for y in np.stack([a, b], 1):
+        decided = np.zeros(2, bool)
+        for look in range(1, LOOKS + 1):
+            there = look * n // LOOKS
+            panel = settings.panel_of(np.where(np.arange(n) < there, y, 0), k * (np.arange(n) < there))
+            for kind, last in enumerate((n, there)):
+                units = {name: f"scenario:{name}" for name in names[:last]}
+                c = watched_pair(panel, (0, 1), 0.95, SequentialPlan(units, (k, k)))
+                decided[kind] |= bool(c.p < 0.05 and c.differing >= LEAST_DIFFERING)
+        planned.append(decided[0])
+        grown.append(decided[1])
+    for what, found in (
+        ("sequential test, both logs growing, ten looks", planned),
+        ("the same, planned for what is there", grown),
+    ):
+        yield Line(what, n, setting, float(np.mean(found)), np.nan, len(found), True)
 
 
 def _sequential(row: np.ndarray, n: int, k: int) -> SequentialTest:

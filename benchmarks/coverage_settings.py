@@ -23,6 +23,7 @@ from lerobot_roborecover.analysis.intervals import (
     ratio_interval,
     spread,
 )
+from lerobot_roborecover.analysis.macro import LEAST_IN_CELL
 from lerobot_roborecover.analysis.panel import Panel, ScenarioLabels
 from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
 from lerobot_roborecover.analysis.resampling import resample
@@ -93,9 +94,11 @@ def tasks_of(n: int) -> np.ndarray:
 
 
 def cells_of(n: int) -> np.ndarray:
-    """(n,) cells in the shares of the paper's set."""
-    share = np.cumsum(CELLS) / sum(CELLS)
-    return np.searchsorted(share, (np.arange(n) + 0.5) / n)
+    """(n,) cells in the shares of the paper's set, as many as have the least number of scenarios each."""
+    count = min(len(CELLS), max(1, n // LEAST_IN_CELL))
+    share, more = np.cumsum(CELLS[:count]) / sum(CELLS[:count]), n - count * LEAST_IN_CELL
+    beyond = np.searchsorted(share, (np.arange(more) + 0.5) / more)
+    return np.sort(np.concatenate([np.repeat(np.arange(count), LEAST_IN_CELL), beyond]))
 
 
 def held(what: str, n: int, setting: str, bounds, truth) -> Line:
@@ -152,7 +155,7 @@ def with_tasks(replicates: int) -> Iterator[Line]:
 
 
 def macro(replicates: int) -> Iterator[Line]:
-    """Macro over nine cells of unlike size and rate."""
+    """Macro over up to nine cells of unlike size and rate, and with a smallest one unlike the others."""
     for n in SIZES:
         cell = cells_of(n)
         labels = np.unique(cell)
@@ -165,6 +168,27 @@ def macro(replicates: int) -> Iterator[Line]:
                     # The mean over cells is of the cells as they are: their scenarios are what is drawn.
                     bounds = rate_interval(spread(y, cells=cell))
                     yield held("Macro", n, setting, bounds, of_cell[labels].mean())
+    yield from small_cell(replicates, LEAST_IN_CELL)
+
+
+def small_cell(replicates: int, size: int) -> Iterator[Line]:
+    """Macro over the paper's nine cells, the smallest of which has so many scenarios and a rate of its own.
+
+    What `LEAST_IN_CELL` was chosen by: `python benchmarks/coverage.py --small-cells`.
+    """
+    sizes = np.array([size, *sorted(CELLS)[1:]])
+    cell, n = np.repeat(np.arange(len(sizes)), sizes), 200
+    for k in TRIALS:
+        for name in ("equal", "beta 1"):
+            for own in (0.05, 0.2, 0.5, 0.8, 0.95):
+                for others in (0.03, 0.1, 0.3, 0.5, 0.9):
+                    rng = rng_of("small cell", size, k, name, own, others)
+                    setting = f"{k} trials, {name}, rate {own} of {size} scenarios, {others} of the others"
+                    p = np.where(cell == 0, own, others)
+                    y = rng.binomial(k, scenario_rates(rng, p, len(cell), SCATTER[name], replicates)) / k
+                    truth = (own + (len(sizes) - 1) * others) / len(sizes)
+                    bounds = rate_interval(spread(y, cells=cell))
+                    yield held("Macro, its smallest cell unlike the others", n, setting, bounds, truth)
 
 
 def differences(replicates: int) -> Iterator[Line]:
@@ -305,7 +329,7 @@ def chosen(replicates: int) -> Iterator[Line]:
             found: dict[str, list] = {}
             for _ in range(count):
                 y = rng.binomial(k, scenario_rates(rng, np.array(p)[:, None], n, scatter, POLICIES))
-                panel = _panel(y, k)
+                panel = panel_of(y, k)
                 others = list(range(1, POLICIES))
                 gain = gain_over(panel.successes, panel.trials, 0, others, draws)
                 found.setdefault("source gain", []).append(gain)
@@ -320,13 +344,14 @@ def chosen(replicates: int) -> Iterator[Line]:
                 yield held(f"{what}, cross-fitted", n, setting, bounds, truth)
 
 
-def _panel(successes: np.ndarray, trials: int) -> Panel:
+def panel_of(successes: np.ndarray, trials: int | np.ndarray) -> Panel:
+    """A panel of (policies, scenarios) successes; trials of every scenario, or of each."""
     labels = [
         ScenarioLabels(f"s{i:03d}", "libero", "", "", "", "", "", "", "", 300)
         for i in range(successes.shape[1])
     ]
-    full = np.full(successes.shape, trials)
-    return Panel(tuple("abcdef"), tuple(labels), successes, full, np.zeros_like(full), {})
+    full = np.broadcast_to(trials, successes.shape)
+    return Panel(tuple("abcdef"[: len(successes)]), tuple(labels), successes, full, np.zeros_like(full), {})
 
 
 ORDERS = {

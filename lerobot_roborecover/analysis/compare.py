@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,12 @@ from lerobot_roborecover.analysis.logs import Study
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.results import Options, Results, analyse
 from lerobot_roborecover.analysis.runs import MethodContrast, MethodRate
+from lerobot_roborecover.analysis.sequential_plan import keep_plan, recorded_plan
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.tables import NOT_DEFINED, Column, Table, cell_text, to_text
 from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict, method_text, verdict_text
+from lerobot_roborecover.scenario import Start
 
 _BAR_WIDTH = 41
 
@@ -83,6 +85,8 @@ def compare(
             f"--sequential: no scenario's turn has come in {first} and {second}. It counts scenarios in the "
             "order in which roborecover eval --sequential runs them"
         )
+    if contrast.sequential and options.sequential:
+        _keep_plan(results, contrast)
     if not contrast.scenarios:
         raise RowsError(f"{first} and {second} were run on different scenarios: there is none in common")
     panel = _pair_panel(results, first, second)
@@ -126,6 +130,23 @@ def compare(
         },
         tuple(dict.fromkeys(remarks)),
     )
+
+
+def _keep_plan(results: Results, contrast: Contrast) -> None:
+    """Keeps the plan of the first look beside a log, unless a run of `eval --sequential` keeps one there."""
+    names, study = results.recovery.arms, results.study
+    pair = names.index(contrast.a), names.index(contrast.b)
+    if not study.files:
+        return
+    arms = {arm.title: arm for arm in study.of(Start.RECOVERY)}
+    two, record = (arms[contrast.a], arms[contrast.b]), results.record_of(contrast.a, contrast.b)
+    if record is None:
+        keep_plan(study, two, results.sequential_plan(pair), contrast, results.options.level)
+    elif record.against_trials:
+        plan = recorded_plan(record, results.recovery)
+        if record.config_hash != two[0].rows[0].config_hash:
+            plan = replace(plan, trials=plan.trials[::-1])
+        keep_plan(study, two, plan, contrast, record.level)
 
 
 def _choose(titles: Sequence[str], a: str | None, b: str | None) -> tuple[str, str]:

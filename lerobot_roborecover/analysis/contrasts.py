@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -42,6 +42,8 @@ class Contrast:
     """What the units are, in words."""
     sequential: bool = False
     """Whether p and interval hold although the run was watched, and stopped when it was decided."""
+    barred: ComparisonVerdict | None = None
+    """Why no verdict can rest on one of the two, see `soundness.py`; such a contrast is in no family."""
 
     @property
     def verdict(self) -> ComparisonVerdict:
@@ -62,6 +64,7 @@ def contrasts(
     *,
     unit: str = "scenarios",
     complete: bool = True,
+    barred: Mapping[str, ComparisonVerdict] | None = None,
 ) -> list[Contrast]:
     """Paired contrasts, which are one family: what is asked of them is one question.
 
@@ -72,6 +75,7 @@ def contrasts(
         pairs: which, by index; by default all.
         unit: what is resampled, in words.
         complete: whether the policies are complete; p is not adjusted, and nothing said, where they are not.
+        barred: names of policies that no verdict can rest on, and why.
     """
     pairs = list(combinations(range(len(rates)), 2)) if pairs is None else list(pairs)
     if not pairs:
@@ -91,9 +95,10 @@ def contrasts(
             int(units[k]),
             differing(totals[k]),
             0,
-            complete,
+            complete and not {names[a], names[b]} & set(barred or ()),
             resampling.level,
             unit,
+            barred=None if barred is None else barred.get(names[a], barred.get(names[b])),
         )
         for k, (a, b) in enumerate(pairs)
     ]

@@ -1,4 +1,4 @@
-"""Rates within groups of scenarios, Macro, and whose deviations who recovers from."""
+"""Rates within groups of scenarios, and whose deviations who recovers from."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_roborecover.analysis.crossfit import gain_over
-from lerobot_roborecover.analysis.intervals import Estimate, clean
+from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
+from lerobot_roborecover.analysis.resampling import Resampling
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 
 
@@ -50,44 +50,6 @@ def group_rates(
         own = resampling.part(index)
         groups.append(Group(name, len(index), tuple(own.rates(panel.rates[:, index].T))))
     return groups
-
-
-def macro_estimates(panel: Panel, resampling: Resampling) -> list[Estimate]:
-    """Macro RSR of every policy: the mean over the panel's cells of the cell's mean rate.
-
-    NaN for a policy without a trial in one of the cells: a mean over fewer is another number.
-    """
-    labels = panel.labels("cell")
-    cells = set(labels.tolist())
-    estimates = resampling.rates(panel.rates.T, cells=labels)
-    return [
-        e if set(labels[np.isfinite(rates)].tolist()) == cells else Estimate(np.nan, np.nan, np.nan)
-        for e, rates in zip(estimates, panel.rates, strict=True)
-    ]
-
-
-def percentile_macro(panel: Panel, resampling: Resampling) -> list[Estimate]:
-    """The paper's percentile bootstrap of Macro RSR, to compare with the paper.
-
-    A draw that leaves a cell empty averages the others.
-    """
-    labels, cells = panel.labels("cell"), panel.occupied("cell")
-    member = np.stack([labels == cell for cell in cells])  # (C, N)
-    policies = len(panel.arms)
-    values = np.where(member[None], panel.rates[:, None, :], np.nan).reshape(policies * len(cells), -1).T
-    points = masked_mean(values).reshape(policies, len(cells))
-    draws = resampling.means(values).reshape(-1, policies, len(cells))
-    low, high = resampling.interval(_mean_of_known(draws))
-    return [
-        Estimate(float(v), float(clean(a)), float(clean(b)))
-        for v, a, b in zip(_mean_of_known(points), low, high, strict=True)
-    ]
-
-
-def _mean_of_known(values: np.ndarray) -> np.ndarray:
-    known = np.isfinite(values)
-    total, count = np.where(known, values, 0).sum(-1), known.sum(-1)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 
 @dataclass(frozen=True)

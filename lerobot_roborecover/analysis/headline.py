@@ -10,13 +10,19 @@ from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.soundness import invalid_words, valid_trials
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.words import counted
 
 
 def headline(results: Results) -> str:
     """The result in a few sentences, every claim by `verdicts.py`."""
-    best = results.best_first[0]
+    trials = valid_trials(results.ranked)
+    valid = [p for p in results.best_first if trials[p]]
+    if not valid:
+        every = range(len(results.ranked.arms))
+        return f"No trial was valid {invalid_words(results.ranked, every)}."
+    best = valid[0]
     name, rate = results.ranked.arms[best], results.ranked_rates[best]
     sentences = [
         f"{name} recovers in {100 * rate.value:.1f} % of its trials, averaged over scenarios"
@@ -35,8 +41,16 @@ def headline(results: Results) -> str:
         sentences.append(_method(results, name))
     if not results.compared.complete:
         sentences.append(_who(results))
-    rivals = [results.ranked.arms[p] for p in results.best_first[1:]]
-    if rivals:
+    if without := [p for p in results.best_first if p not in valid]:
+        names = ", ".join(results.ranked.arms[p] for p in without)
+        sentences.append(f"No trial of {names} was valid {invalid_words(results.ranked, without)}.")
+    if results.barred.get(name) is ComparisonVerdict.COUNTS_DEPEND:
+        sentences.append(
+            "Its rate is biased, and no verdict rests on it: its trial counts go with its outcomes. Evaluate "
+            "every scenario the same number of times."
+        )
+    rivals = [results.ranked.arms[p] for p in valid[1:]]
+    if rivals and name not in results.barred:
         sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))
     return " ".join(sentences)
 
@@ -83,8 +97,9 @@ def _who(results: Results) -> str:
 def _standing(best: str, found: list[Contrast]) -> str:
     """From whom the first is separated, and from whom not."""
     few = [c.b for c in found if c.verdict is ComparisonVerdict.TOO_FEW]
-    level = [c.b for c in found if not c.verdict.separated and c.verdict is not ComparisonVerdict.TOO_FEW]
-    if not few and not level:
+    barred = [c.b for c in found if c.barred is not None]
+    level = [c.b for c in found if not c.verdict.separated and c.b not in (*few, *barred)]
+    if not few and not level and not barred:
         others = "the other policy" if len(found) == 1 else f"all {len(found)} other policies"
         return f"It is separated from {others}."
     parts = []
@@ -96,4 +111,6 @@ def _standing(best: str, found: list[Contrast]) -> str:
             f"No verdict on those that differ from it on fewer than {LEAST_DIFFERING} {unit}: "
             f"{', '.join(few)}."
         )
+    if barred:
+        parts.append(f"No verdict on those whose trial counts go with their outcomes: {', '.join(barred)}.")
     return " ".join(parts)

@@ -8,6 +8,10 @@ says.
   of the number of trials: p (1 - p) over the variance of the rate, and Student's t for the normal quantile
   (as Korn and Graubard 1998 do for the exact interval). The variance is that between units, with the variance
   of one all-or-nothing unit mixed in, because a few equal units say little about how far others scatter.
+- Where no unit has a success, or none a failure, nothing scatters, and the rate has the exact interval of
+  Clopper and Pearson (1934) over the units. It holds whatever the rates of the scenarios and however many
+  trials each has: at one mean rate, units that are alike fail all together most often. Units of unlike weight
+  have its equivalent (`_all_alike`): the largest mean rate at which all fail with the chance left for it.
 - A paired difference has Student's t with one unit more, half of it won by each side: what Bonett and Price
   (2012) do for pairs of yes and no.
 - A number that is no mean, such as F1 or the area under a curve, has the interval of a rate, its variance
@@ -23,7 +27,7 @@ takes one column of scenarios or many at once: the last axis is the scenarios'.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import special
@@ -61,6 +65,8 @@ class Spread:
     """Units of one weight that would weigh as these do: 1 over the sum of their squared weights."""
     freedom: float | np.ndarray
     """Degrees of freedom of the variance."""
+    weights: np.ndarray | None = field(default=None, compare=False, repr=False)
+    """(..., U) shares of the units in the mean; None where the effective number stands for them."""
 
 
 def spread(
@@ -126,6 +132,7 @@ def spread(
         _plain(count),
         _plain(_over(1.0, squares)),
         _plain(np.where(count > 1, np.maximum(np.minimum(own, freedom), _LEAST_FREEDOM), 0.0)),
+        weight,
     )
 
 
@@ -153,6 +160,7 @@ def jackknife(value: np.ndarray | float, left_out: np.ndarray, weights: np.ndarr
         _plain(count),
         _plain(_over(1.0, squares)),
         _plain(np.where(count > 1, np.maximum(freedom, _LEAST_FREEDOM), 0.0)),
+        w,
     )
 
 
@@ -202,7 +210,8 @@ def estimates_of(values: float | np.ndarray, bounds: Bounds) -> list[Estimate]:
 
 
 def rate_interval(found: Spread, level: float = LEVEL) -> Bounds:
-    """Interval of a mean of numbers from 0 to 1: Agresti-Coull with the effective number of units.
+    """Interval of a mean of numbers from 0 to 1: Agresti-Coull with the effective number of units, or
+    Clopper-Pearson where all units are 0 or all are 1.
 
     Returns:
         Bounds in [0, 1]; NaN for fewer than two units, which say nothing about how they scatter.
@@ -218,7 +227,28 @@ def rate_interval(found: Spread, level: float = LEVEL) -> Bounds:
         count = effective + q * q
         centre = (p * effective + q * q / 2) / count
         half = q * np.sqrt(np.maximum(centre * (1 - centre), 0.0) / count)
-    return _bounds(found, np.maximum(centre - half, 0.0), np.minimum(centre + half, 1.0))
+    reach = _all_alike(found, (1 - level) / 2)
+    none, every = value <= _TINY, value >= 1 - _TINY
+    low = np.where(every, 1 - reach, np.where(none, 0.0, np.maximum(centre - half, 0.0)))
+    high = np.where(none, reach, np.where(every, 1.0, np.minimum(centre + half, 1.0)))
+    return _bounds(found, low, high)
+
+
+def _all_alike(found: Spread, chance: float) -> np.ndarray:
+    """(...) the largest mean rate at which all units fail together with the given chance, whatever the rates
+    of the units: 1 - chance ** (1 / n) of n units that weigh the same, which is Clopper and Pearson's bound.
+
+    The product of the units' chances to fail is largest, at one mean rate, where the m heaviest units fail
+    with chances that are inversely proportional to their weights, and the others surely.
+    """
+    if found.weights is None:
+        return 1 - chance ** (1 / np.maximum(np.asarray(found.effective, float), 1.0))
+    w = -np.sort(-found.weights, axis=-1)
+    number = np.arange(1, w.shape[-1] + 1)
+    logs = np.log(np.where(w > 0, w, 1.0)).cumsum(-1)
+    common = np.exp((np.log(chance) + logs) / number)
+    allowed = (w > 0) & (common <= w)
+    return np.where(allowed, w.cumsum(-1) - number * common, 0.0).max(-1, initial=0.0)
 
 
 def difference_interval(found: Spread, level: float = LEVEL) -> Bounds:
@@ -296,7 +326,8 @@ def ratio_interval(
 
 
 def _arrays(found: Spread) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(getattr(found, field.name), float) for field in fields(found))
+    of = (found.value, found.variance, found.units, found.effective, found.freedom)
+    return tuple(np.asarray(values, float) for values in of)
 
 
 def _quantile(level: float, freedom: float | np.ndarray) -> np.ndarray:

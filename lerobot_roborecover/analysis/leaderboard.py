@@ -21,15 +21,16 @@ from lerobot_roborecover.analysis.arms import Arm, arm_of, stopped
 from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.first_states import with_first_states
-from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.logs import clock_of
+from lerobot_roborecover.analysis.macro import MacroCells, cells_of, macro_9_estimates, macro_estimates
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import Panel, make_panel
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
@@ -65,6 +66,9 @@ class Entry:
     policy: str
     rsr: Estimate
     macro: Estimate
+    """Over the board's cells that are large enough, see `Board.cells`."""
+    macro9: Estimate
+    """Over the paper's nine cells; undefined where the set or the entry lacks one."""
     initial: Estimate
     behind: Estimate
     """Best complete entry of the board minus this one, on common scenarios."""
@@ -104,6 +108,8 @@ class Board:
     options: Options
     unit: str
     """What intervals and tests take as independent, in words."""
+    cells: MacroCells
+    """Which cells Macro averages, and which are too small."""
 
 
 @dataclass(frozen=True)
@@ -284,6 +290,7 @@ def _board(
     unit = panel.unit(options.cluster)
     draws = resample(panel.units(unit), options.draws, options.seed, options.level)
     rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
+    macro9 = macro_9_estimates(panel, draws)
     run = (panel.trials > 0).sum(1)
     acting = [any(r.interventions for r in arm.rows) for arm in arms]
     ranked = [
@@ -296,7 +303,10 @@ def _board(
     behind = [_undefined()] * len(arms)
     if best is not None:
         behind = draws.differences((panel.rates[best] - panel.rates).T)
-    found = contrasts(panel.rates, panel.arms, draws, list(combinations(ranked, 2)), unit=WORDS[unit])
+    found = contrasts(
+        panel.rates, panel.arms, draws, list(combinations(ranked, 2)), unit=WORDS[unit],
+        barred=barred_arms(panel),
+    )  # fmt: skip
     between = dict(zip(combinations(ranked, 2), found, strict=True))
     entries = []
     for p, (e, rows) in enumerate(usable.items()):
@@ -307,6 +317,7 @@ def _board(
                 policy=e[0],
                 rsr=rsr[p],
                 macro=macro[p],
+                macro9=macro9[p],
                 initial=_initial(_arm(e, initial, Start.INITIAL, run_of), options)
                 if initial
                 else _undefined(),
@@ -328,8 +339,9 @@ def _board(
     name = f"{dataset}, {split}{kind}"
     digest = hashlib.sha256("\n".join(f"{i} {h}" for i, h in sorted(scenario_set)).encode()).hexdigest()[:12]
     board = Board(
-        platform, name, digest, len(panel.scenarios), dict(simulators), tuple(entries), options, WORDS[unit]
-    )
+        platform, name, digest, len(panel.scenarios), dict(simulators), tuple(entries), options, WORDS[unit],
+        cells_of(panel, draws),
+    )  # fmt: skip
     before = [
         _arm(e, rows, Start.INITIAL, run_of)
         for e, rows in usable.items()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard, as_json, ranks, separated
+from lerobot_roborecover.analysis.macro import MACRO_9
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
@@ -44,8 +45,10 @@ def write_leaderboard(
 def board_table(board: Board, number: int = 0) -> Table:
     """One board's entries."""
     rows, several = [], any(entry.runs > 1 for entry in board.entries)
+    own_macro = bool(board.cells.counted) and not board.cells.is_macro_9
     for rank, entry in zip(ranks(board), board.entries, strict=True):
-        numbers = (entry.macro, entry.initial, entry.scenarios, entry.trials, entry.invalid)
+        macro = (entry.macro, entry.macro9) if own_macro else (entry.macro9,)
+        numbers = (*macro, entry.initial, entry.scenarios, entry.trials, entry.invalid)
         standing, day = _standing(entry, rank), entry.provenance.finished_at[:10]
         runs = (entry.runs, entry.other_runs, entry.run_sd) if several else ()
         rows.append((entry.policy, rank, entry.rsr, *runs, entry.behind, standing, *numbers, day))
@@ -53,7 +56,9 @@ def board_table(board: Board, number: int = 0) -> Table:
         Column("Policy"), Column("Rank"), Column("RSR %", "percent"),
         *((Column("Runs", "count"), Column("RSR %, runs like these", "percent"),
         Column("SD between runs", "points")) if several else ()),
-        Column("Behind the best", "points"), Column("Standing"), Column("Macro %", "percent"),
+        Column("Behind the best", "points"), Column("Standing"),
+        *((Column(f"{board.cells.title} %", "percent"),) if own_macro else ()),
+        Column(f"{MACRO_9} %", "percent"),
         Column("Initial state %", "percent"), Column("Scenarios", "count"), Column("Trials", "count"),
         Column("Invalid", "count"), Column("Last trial"),
     )  # fmt: skip
@@ -65,6 +70,7 @@ def board_table(board: Board, number: int = 0) -> Table:
         "Incomplete entries lack scenarios of the set and have no rank; neither have interventions.",
         f"Scenario set {board.scenario_set} ({board.scenarios} scenarios), by content: other sets are other "
         "boards.",
+        *board.cells.notes(board.unit),
         *((_OF_RUNS,) if several else ()),
     )
     title = f"{board.platform}: {board.dataset}, set {board.scenario_set}"
@@ -88,6 +94,8 @@ def _standing(entry: Entry, rank: str) -> str:
         return "best"
     if separated(entry):
         return "behind the best"
+    if entry.verdict in (ComparisonVerdict.COUNTS_DEPEND, ComparisonVerdict.NO_VALID_TRIAL):
+        return entry.verdict.value
     return (
         "no verdict: too few differ"
         if entry.verdict is ComparisonVerdict.TOO_FEW

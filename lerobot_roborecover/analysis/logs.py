@@ -6,8 +6,8 @@ report shows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
@@ -58,6 +58,8 @@ class Study:
     logs: tuple[Path, ...]
     sequential: tuple[SequentialRecord, ...] = ()
     """Runs of these logs that were watched while they went."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """First log of every policy, by its name in the report."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -87,11 +89,14 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     run_of: dict[int, int] = {}
     """By the identity of a row; of rows that are of no run, or of the first, nothing is said."""
     twice = 0
+    files: dict[str, Path] = {}
     runs: dict[str, dict[int, str]] = {}
     records: list[SequentialRecord] = []
-    files = list(_files(logs))
-    found, unknown = with_first_states([read_log(path, name or None) for name, _, path in files])
-    for (name, run, path), log in zip(files, found, strict=True):
+    named = list(_files(logs))
+    found, unknown = with_first_states([read_log(path, name or None) for name, _, path in named])
+    for (name, run, path), log in zip(named, found, strict=True):
+        for policy in log.policies:
+            files.setdefault(name or policy, log.path)
         if run is not None:
             runs.setdefault(name, {}).setdefault(run, _run_name(path))
         if (record := read_record(path)) is not None:
@@ -138,7 +143,9 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     check_runs(kept, runs, run_of)
     arms = stopped(arms_of(kept, runs, run_of), records)
     remarks += arm_remarks(arms) + sequential_remarks(arms, records)
-    return Study(kept[0].platform, arms, tuple(remarks), tuple(log.path for log in found), tuple(records))
+    return Study(
+        kept[0].platform, arms, tuple(remarks), tuple(log.path for log in found), tuple(records), files
+    )
 
 
 def _place(row: TrialRow, logs: Sequence[ReadLog]) -> str:
@@ -197,11 +204,11 @@ def _check_scenarios(rows: Sequence[TrialRow], logs: Sequence[ReadLog]) -> None:
         before, first = known.setdefault(row.scenario_id, (values, row))
         if before == values:
             continue
-        for field, one, other in zip(_FIXED_BY_SCENARIO, before, values, strict=True):
+        for name, one, other in zip(_FIXED_BY_SCENARIO, before, values, strict=True):
             if one != other:
                 raise RowsError(
-                    f"{_place(row, logs)}: field {field!r}: logs of different scenario sets: scenario "
-                    f"{row.scenario_id} has {field} {one!r} for {first.policy} (dataset {first.dataset}) and "
+                    f"{_place(row, logs)}: field {name!r}: logs of different scenario sets: scenario "
+                    f"{row.scenario_id} has {name} {one!r} for {first.policy} (dataset {first.dataset}) and "
                     f"{other!r} for {row.policy} (dataset {row.dataset}). Evaluate both on one set"
                 )
 

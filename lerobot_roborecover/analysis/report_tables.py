@@ -9,15 +9,16 @@ from itertools import combinations
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
 from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions, task_gains
-from lerobot_roborecover.analysis.groups import (
-    Group,
-    group_rates,
+from lerobot_roborecover.analysis.groups import Group, group_rates, source_matrix
+from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.macro import (
+    MACRO_9,
+    PAPER_CELLS,
+    cells_of,
+    macro_9_estimates,
     macro_estimates,
     percentile_macro,
-    source_matrix,
 )
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.ranking import rank_agreement
 from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
@@ -65,49 +66,48 @@ def all_tables(results: Results) -> list[Table]:
     return tables
 
 
-def macro_title(panel: Panel) -> str:
-    """`Macro-9` where nine cells of the set are occupied."""
-    return f"Macro-{len(panel.occupied('cell'))}"
-
-
 def overall(results: Results) -> Table:
     """Initial rate, RSR, Macro, retention, RSR without invalid trials; for other tasks; and as in the
     paper."""
     panel, draws = results.recovery, results.draws
-    rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
+    rsr, cells = draws.rates(panel.rates.T), cells_of(panel, draws)
+    macro = {MACRO_9: macro_9_estimates(panel, draws)}
+    if cells.counted and not cells.is_macro_9:
+        macro = {cells.title: macro_estimates(panel, draws), **macro}
     retention = results.retention
     initial = initial_estimates(results)
     valid = masked_mean(panel.valid_rates.T)
     tasks = rsr if results.tasks is None else results.tasks.rates(panel.rates.T)
-    paper, paper_macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws)
+    paper, paper_macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws, PAPER_CELLS)
     rows = [
         (
-            policy, initial[p], rsr[p], macro[p], retention[p], int((panel.trials[p] > 0).sum()),
-            int(panel.trials[p].sum()), int(panel.invalid[p].sum()), float(valid[p]), tasks[p], paper[p],
-            paper_macro[p] if not math.isnan(macro[p].value) else _NOBODY,
+            policy, initial[p], rsr[p], *(found[p] for found in macro.values()), retention[p],
+            int((panel.trials[p] > 0).sum()), int(panel.trials[p].sum()), int(panel.invalid[p].sum()),
+            float(valid[p]), tasks[p], paper[p], paper_macro[p],
         )
         for p, policy in enumerate(panel.arms)
     ]  # fmt: skip
     columns = (
         Column("Policy"), Column("Initial state %", "percent"), Column("RSR %", "percent"),
-        Column(f"{macro_title(panel)} %", "percent"), Column("Retention", "ratio"), Column("Scenarios",
-        "count"), Column("Trials", "count"), Column("Invalid", "count"), Column("RSR % without invalid",
-        "percent"), Column("RSR %, tasks like these", "percent"),
+        *(Column(f"{title} %", "percent") for title in macro), Column("Retention", "ratio"),
+        Column("Scenarios", "count"), Column("Trials", "count"), Column("Invalid", "count"),
+        Column("RSR % without invalid", "percent"), Column("RSR %, tasks like these", "percent"),
         Column("RSR % (percentile bootstrap, as in the paper)", "percent"),
-        Column(f"{macro_title(panel)} % (percentile bootstrap, as in the paper)", "percent"),
+        Column(f"{MACRO_9} % (percentile bootstrap, as in the paper)", "percent"),
     )  # fmt: skip
     notes = (
-        "RSR: mean of the scenarios' success rates, each scenario counting the same. Macro: mean "
-        "of the occupied "
-        "cells' rates, for policies with trials in all of them. "
-        f"{_of_first_states(results)}"
+        "RSR: mean of the scenarios' success rates, each scenario counting the same. Macro-k: mean "
+        "of the rates of the k cells that are large enough, for policies with trials in all of them; "
+        f"{MACRO_9}: of the paper's nine cells, and of no fewer. {_of_first_states(results)}"
         "Invalid trials count "
         "as failures, except under “RSR % without invalid”, where they and scenarios without a valid trial "
         "are left out.",
         f"[{100 * draws.level:g} % intervals] of rates: Agresti-Coull with the effective number of "
-        f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not (docs/report.md); "
+        f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not (docs/report.md), "
+        "and Clopper-Pearson where no trial or every trial succeeds; "
         f"they speak of {ESTIMAND[panel.unit(results.options.cluster)]}. {_of_tasks(results)}Percentile "
         f"bootstrap, as in the paper: {draws.draws} draws, seed {draws.seed}, to compare with the paper.",
+        *cells.notes(results.unit),
     )
     return Table("overall", "Overall results", columns, tuple(rows), notes)
 
@@ -183,7 +183,9 @@ def paired_contrasts(results: Results) -> Table:
     notes = (
         "Percentage points, over the scenarios that both were run on. Intervals are not adjusted; p (Holm) "
         f"is, for the {family} pairs of complete policies. p: paired sign-flip permutation test over "
-        f"{results.unit}.",
+        f"{results.unit}. It tests whether their differences are as likely to have either sign, not whether "
+        "their mean is zero: a policy that is much better on few and a little worse on many can be told "
+        "apart from one with the same RSR.",
         f"Verdict: p (Holm) below {1 - level:.3g}, and at least {LEAST_DIFFERING} {results.unit} on which "
         "the two differ; incomplete policies have none.",
         *_watched_note(results),
@@ -411,7 +413,8 @@ def interventions(results: Results) -> Table:
         "intervention solves. "
         "Harmed: direct control solves, the intervention loses. p (Holm): for the interventions of this "
         "table, each against its direct control. Tasks like these: the same over tasks, for "
-        f"{ESTIMAND[ResamplingUnit.TASK]}; Holm for the same family.",
+        f"{ESTIMAND[ResamplingUnit.TASK]}; Holm for the same family. p: sign flips, which test whether "
+        "differences are as likely to have either sign, not whether their mean is zero.",
     )
     return Table("interventions", "Interventions against direct control", columns, tuple(rows), notes)
 
@@ -419,9 +422,7 @@ def interventions(results: Results) -> Table:
 def beside_published(results: Results) -> Table:
     """This study's policies beside the paper's twelve rows and LIBERO-Plus."""
     panel, draws = results.recovery, results.draws
-    rsr, macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws)
-    whole = macro_estimates(panel, draws)
-    macro = [m if not math.isnan(w.value) else _NOBODY for m, w in zip(macro, whole, strict=True)]
+    rsr, macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws, PAPER_CELLS)
     initial = initial_estimates(results, as_in_the_paper=True)
     rated: list[tuple[Estimate, tuple[Cell, ...]]] = [
         (rsr[p], (policy, "this report", initial[p], rsr[p], macro[p], None))
@@ -438,7 +439,7 @@ def beside_published(results: Results) -> Table:
     rows = tuple(cells for _, cells in sorted(rated, key=lambda pair: -pair[0].value))
     columns = (
         Column("Policy"), Column("Origin"), Column("Initial state %", "percent"),
-        Column("RSR %", "percent"), Column("Macro %", "percent"), Column("LIBERO-Plus %", "percent"),
+        Column("RSR %", "percent"), Column(f"{MACRO_9} %", "percent"), Column("LIBERO-Plus %", "percent"),
     )  # fmt: skip
     said = f" ({'; '.join(remarks)})" if remarks else ""
     notes = (
@@ -447,5 +448,6 @@ def beside_published(results: Results) -> Table:
         "only where its trials "
         "are on the paper's 200 test scenarios of the platform. LIBERO-Plus: totals published by others, "
         f"another benchmark{said}.",
+        *(note for note in cells_of(panel, draws).notes(results.unit) if note.startswith(MACRO_9)),
     )
     return Table("published", "Beside the published results", columns, rows, notes)

@@ -27,8 +27,11 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
+from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
+from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
 
@@ -52,6 +55,8 @@ class Options:
     """Rank all policies, on the scenarios common to all; by default those that are complete."""
     sequential: bool = False
     """Whether all pairs are tested so that the logs may be looked at while they grow."""
+    planned: Mapping[str, str] | None = None
+    """Units of the planned scenarios by id, for that; by default those that the rows name."""
 
     def __post_init__(self):
         if self.draws < 100:
@@ -144,6 +149,11 @@ class Results:
         return self.resample(self.recovery, ResamplingUnit.TASK)
 
     @cached_property
+    def barred(self) -> Mapping[str, ComparisonVerdict]:
+        """Policies that no verdict can rest on, and why."""
+        return barred_arms(self.recovery)
+
+    @cached_property
     def contrasts(self) -> tuple[Contrast, ...]:
         """All pairs of policies. Those of ranked ones are one family, on the ranked scenarios."""
         chosen, count = self.compared.policies, len(self.recovery.arms)
@@ -151,7 +161,9 @@ class Results:
             (chosen[k], chosen[m]): c
             for (k, m), c in zip(
                 combinations(range(len(chosen)), 2),
-                contrasts(self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit),
+                contrasts(
+                    self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit, barred=self.barred
+                ),
                 strict=True,
             )
         }
@@ -167,6 +179,7 @@ class Results:
                     outside,
                     unit=self.unit,
                     complete=False,
+                    barred=self.barred,
                 ),
                 strict=True,
             )
@@ -179,16 +192,25 @@ class Results:
         for indices in (pair, (pair[1], pair[0])):
             record = self._records.get((panel.arms[indices[0]], panel.arms[indices[1]]))
             if record is not None:
-                found = watched_pair(
-                    panel, indices, level,
-                    scenarios=record.scenarios, trials=record.trials, planned_level=record.level,
-                )  # fmt: skip
+                check_plan(record, self.options.planned)
+                found = watched_pair(panel, indices, level, recorded_plan(record, panel), record.level)
                 return found if indices == pair else found.turned()
-        return watched_pair(panel, pair, level) if self.options.sequential else None
+        if not self.options.sequential:
+            return None
+        return watched_pair(panel, pair, level, self.sequential_plan(pair))
+
+    def sequential_plan(self, pair: tuple[int, int]) -> SequentialPlan:
+        """What the comparison of two policies of the recovery panel was to be over, by their rows."""
+        o = self.options
+        return plan_of(self.recovery, pair, self._direct, o.planned, o.scheduled)
 
     @cached_property
     def _records(self) -> Mapping[tuple[str, str], SequentialRecord]:
         return recorded_pairs(self.study.sequential, self._direct)
+
+    def record_of(self, a: str, b: str) -> SequentialRecord | None:
+        """The record that keeps the plan of two policies' comparison, in either order."""
+        return self._records.get((a, b)) or self._records.get((b, a))
 
     @cached_property
     def runs(self) -> tuple[RunRates, ...]:
@@ -250,7 +272,15 @@ class Results:
             for some, ok in ((inside, True), (outside, False))
             for pair, c in zip(
                 some,
-                contrasts(panel.rates, panel.arms, draws, some, unit=self.unit, complete=ok),
+                contrasts(
+                    panel.rates,
+                    panel.arms,
+                    draws,
+                    some,
+                    unit=self.unit,
+                    complete=ok,
+                    barred=barred_arms(panel),
+                ),
                 strict=True,
             )
         }
@@ -312,6 +342,8 @@ class Results:
         both = np.isfinite(self.initial_rates) & np.isfinite(self.recovery.rates)
         keep = np.zeros(both.shape, bool)
         keep[np.ix_(self.compared.policies, self.compared.scenarios)] = True
+        initial = {} if self.initial is None else barred_arms(self.initial)
+        keep[[p for p, arm in enumerate(self.recovery.arms) if arm in self.barred or arm in initial]] = False
         return compared(both & keep, self.recovery.arms)
 
     @property
@@ -393,6 +425,12 @@ def analyse(study: Study, options: Options | None = None) -> Results:
     panel = make_panel(direct, options.scheduled)
     if words := _compared(panel, direct, options).words:
         remarks.append(words)
+    remarks += [
+        f"{name}: its trial counts go with its outcomes (more trials where the first ones failed, or fewer), "
+        "so its rate is biased and has no verdict. Evaluate every scenario the same number of times"
+        for name, why in barred_arms(panel).items()
+        if why is ComparisonVerdict.COUNTS_DEPEND
+    ]
     if options.common and not (panel.trials > 0).all(0).any():
         raise RowsError("--common: no scenario was run by all policies")
     return Results(

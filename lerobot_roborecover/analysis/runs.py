@@ -215,8 +215,10 @@ def _crossed(units: Spread, runs: Sequence[tuple[float, int]], shared: float) ->
     variance = max(between + units.variance - shared, between, units.variance)
     parts = sum(v * v / f for v, f in runs) + units.variance**2 / units.freedom
     own = sum(f for _, f in runs)
+    # One scenario of each run: so many trials are independent for other runs on other scenarios, and no more.
+    apart = min(min(f for _, f in runs) + 1, int(units.units))
     freedom = min(variance**2 / parts if parts > 0 else units.freedom, CAUTION * own, units.freedom)
-    return Spread(units.value, variance, units.units, units.effective, freedom)
+    return Spread(units.value, variance, units.units, units.effective, freedom, np.full(apart, 1 / apart))
 
 
 def method_contrasts(

@@ -46,6 +46,12 @@ class SequentialRecord:
     """Two-sided, valid whenever it is looked at."""
     words: str = ""
     """The decision in a sentence."""
+    units: tuple[str, ...] = ()
+    """Label of the independent unit of every scenario; empty in records of earlier versions."""
+    against_trials: int = 0
+    """Planned trials of the other policy on every scenario; 0 where its log was whole at the start."""
+    against_outcomes: str = ""
+    """SHA-256 of the other policy's rates, which must stay as they were; empty where they may still come."""
 
 
 def record_path(log: Path) -> Path:
@@ -93,7 +99,12 @@ _KINDS = {
 }
 
 
-def _checked(values: dict) -> SequentialRecord:
+_LATER: dict[str, Any] = {"units": [], "against_trials": 0, "against_outcomes": ""}
+"""Fields that records of earlier versions lack."""
+
+
+def _checked(values: dict[str, Any]) -> SequentialRecord:
+    values = {**_LATER, **values}
     for field in fields(SequentialRecord):
         value = values.get(field.name)
         kind = _KINDS[str(field.type)]
@@ -107,5 +118,7 @@ def _checked(values: dict) -> SequentialRecord:
     if len(set(values["scenarios"])) != len(values["scenarios"]) or not values["scenarios"]:
         raise ValueError("field 'scenarios': ids must be there, each once")
     known: dict[str, Any] = {field.name: values[field.name] for field in fields(SequentialRecord)}
-    known["scenarios"] = tuple(values["scenarios"])
+    known["scenarios"], known["units"] = tuple(values["scenarios"]), tuple(values["units"])
+    if known["units"] and len(known["units"]) != len(known["scenarios"]):
+        raise ValueError("field 'units': there must be one for every scenario")
     return SequentialRecord(**known)

@@ -16,6 +16,8 @@ from lerobot_roborecover.analysis.estimators import (
     scenario_rates,
 )
 from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
+from lerobot_roborecover.analysis.macro import MACRO_9, MacroCells, macro_cells, macro_of_scenarios
+from lerobot_roborecover.analysis.units import WORDS, default_unit
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage, Start
 
 UNDERPOWERED_BELOW = 10
@@ -53,6 +55,12 @@ class StartSummary:
     rsr: Estimate
     """Of initial-state trials: first states weigh the same, and are the units of the interval."""
     macro: Estimate
+    """Over the cells that are large enough; undefined where none is."""
+    macro9: Estimate
+    """Over the paper's nine cells; undefined where one is empty."""
+    macro_cells: MacroCells
+    unit: str
+    """What intervals take as independent, in the plural."""
     invalid: Mapping[str, int]
     """Trials by invalid outcome; they count as failures in the rates."""
     without_infrastructure: Estimate | None
@@ -96,12 +104,16 @@ def summarise(rows: Sequence[Mapping[str, Any]], scheduled: int | None = None) -
 def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None) -> StartSummary:
     scenarios = scenario_rates(rows, scheduled)
     cells = sorted(set(scenarios.cells), key=_cell_order)
+    macro, macro9 = macro_of_scenarios(scenarios.rates, scenarios.units, scenarios.cells)
     return StartSummary(
         start=start,
         scenarios=len(scenarios),
         trials=int(scenarios.trials.sum()),
         rsr=_rate_of(start, scenarios),
-        macro=rate_estimate(scenarios.rates, scenarios.units, scenarios.cells),
+        macro=macro,
+        macro9=macro9,
+        macro_cells=macro_cells(scenarios.cells, scenarios.units),
+        unit=WORDS[default_unit(str(rows[0].get("platform", "")))],
         invalid=invalid_counts(rows),
         without_infrastructure=_without_infrastructure(start, rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
@@ -127,21 +139,15 @@ def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
     return CellSummary(cell, len(scenarios), int(scenarios.trials.sum()), estimate)
 
 
-def rate_estimate(
-    rates: np.ndarray,
-    units: Sequence[str],
-    cells: Sequence[str] | None = None,
-    level: float = LEVEL,
-) -> Estimate:
-    """RSR, or Macro where cells are given, with the interval that every table and page shows.
+def rate_estimate(rates: np.ndarray, units: Sequence[str], level: float = LEVEL) -> Estimate:
+    """RSR with the interval that every table and page shows.
 
     Args:
         rates: (n,) in [0, 1].
         units: n labels of what is independent.
-        cells: n labels.
         level: confidence level.
     """
-    found = spread(rates, units, cells=cells)
+    found = spread(rates, units)
     return estimate_of(found.value, rate_interval(found, level))
 
 
@@ -163,7 +169,10 @@ def format_table(summary: Summary) -> str:
         counts = f"{part.scenarios:>10}{part.trials:>8}{sum(part.invalid.values()):>9}"
         lines.append(f"{title:<26}{_rate(part.rsr)}{counts}")
         if start is not Start.INITIAL:
-            lines.append(f"{f'Macro over {len(part.cells)} cells':<26}{_rate(part.macro)}")
+            cells = part.macro_cells
+            if cells.counted and not cells.is_macro_9:
+                lines.append(f"{cells.title:<26}{_rate(part.macro)}")
+            lines.append(f"{MACRO_9:<26}{_rate(part.macro9)}")
     recovery = summary.starts.get(Start.RECOVERY)
     if recovery is not None:
         lines += ["", "Recovery by cell"]
@@ -172,6 +181,7 @@ def format_table(summary: Summary) -> str:
             lines.append(f"{name:<26}{_rate(cell.estimate)}{cell.scenarios:>10}{cell.trials:>8}")
         if any(cell.underpowered for cell in recovery.cells):
             lines.append(f"* fewer than {UNDERPOWERED_BELOW} scenarios: neither rate nor interval says much")
+        lines += recovery.macro_cells.notes(recovery.unit)
     initial = summary.starts.get(Start.INITIAL)
     if initial is not None and initial.first_states < initial.scenarios:
         lines.append(
@@ -192,4 +202,5 @@ def _rate(estimate: Estimate) -> str:
     bounds = (
         f"[{100 * estimate.low:.1f}, {100 * estimate.high:.1f}]" if estimate.low == estimate.low else "n/a"
     )
-    return f"{100 * estimate.value:>7.1f}  {bounds:<15}"
+    value = f"{100 * estimate.value:.1f}" if estimate.value == estimate.value else "n/a"
+    return f"{value:>7}  {bounds if value != 'n/a' else '':<15}"

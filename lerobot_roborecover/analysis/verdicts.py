@@ -28,6 +28,10 @@ class ComparisonVerdict(StrEnum):
     """They differ on fewer than `LEAST_DIFFERING` units."""
     INCOMPLETE = "incomplete"
     """One of them was not run on all scenarios of the comparison."""
+    COUNTS_DEPEND = "no verdict: trial counts depend on outcomes"
+    """One of them has more trials where its first ones failed, or fewer."""
+    NO_VALID_TRIAL = "no verdict: no valid trial"
+    """No trial of one of them ended in success or at the horizon."""
     TOO_FEW_RUNS = "too few runs"
     """Of methods: one of them has fewer than `LEAST_RUNS` runs."""
 
@@ -38,7 +42,9 @@ class ComparisonVerdict(StrEnum):
 
 
 def verdict(contrast: Contrast) -> ComparisonVerdict:
-    """The rule: complete, at least six units differ, and Holm's p within the family is below 1 - level."""
+    """The rule: sound, complete, at least six units differ, and Holm's p in the family is below 1 - level."""
+    if contrast.barred is not None:
+        return contrast.barred
     if not contrast.complete:
         return ComparisonVerdict.INCOMPLETE
     if contrast.differing < LEAST_DIFFERING:
@@ -52,6 +58,8 @@ def method_verdict(contrast: MethodContrast) -> ComparisonVerdict:
     """The rule for the methods behind several runs: the runs at hand are separated, each method has at least
     four, and Holm's p for other runs like these is below 1 - level, too."""
     runs = verdict(contrast.these_runs)
+    if contrast.these_runs.barred is not None:
+        return contrast.these_runs.barred
     if runs is ComparisonVerdict.INCOMPLETE or contrast.these_runs.sequential:
         return ComparisonVerdict.INCOMPLETE
     if min(contrast.runs) < LEAST_RUNS:
@@ -95,6 +103,17 @@ def verdict_text(contrast: Contrast) -> str:
             f"lacks may be no accident. On the {contrast.scenarios} that both were run on, "
             + (f"{ahead} is ahead by {points}. " if d else "neither is ahead. ")
             + "Evaluate the rest, or ask for the common scenarios with --common."
+        )
+    if found is ComparisonVerdict.COUNTS_DEPEND:
+        return (
+            "No verdict: one of the two has more trials of scenarios whose first trials failed, or fewer, so "
+            "its rates depend on when its runs stopped. Evaluate every scenario the same number of times "
+            "(--eval.n_episodes), whatever came out."
+        )
+    if found is ComparisonVerdict.NO_VALID_TRIAL:
+        return (
+            "No verdict: one of the two has no valid trial, which says nothing of the policy. See how its "
+            "trials ended (outcome and reason in its log), and evaluate again."
         )
     if found is ComparisonVerdict.TOO_FEW:
         return (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.sequential import SequentialTest, grid_of, sequence, whole_units
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.units import WORDS
 
@@ -19,9 +20,7 @@ def watched_pair(
     panel: Panel,
     pair: tuple[int, int],
     level: float,
-    *,
-    scenarios: Collection[str] | None = None,
-    trials: int | None = None,
+    plan: SequentialPlan,
     planned_level: float | None = None,
 ) -> Contrast:
     """The sequential contrast of two policies, on the scenarios whose turn has come.
@@ -30,27 +29,17 @@ def watched_pair(
         panel: their trials.
         pair: indices of arms; the first minus the second.
         level: confidence level at which a verdict is wanted.
-        scenarios: ids that the comparison was to be over; by default all of the panel.
-        trials: that each scenario was to have from the first policy; by default as many as most have.
+        plan: what the comparison was to be over, fixed before the first look.
         planned_level: level at which it was to stop; by default `level`.
     """
     a, b = pair
-    ids = [s.id for s in panel.scenarios]
-    chosen = set(ids if scenarios is None else scenarios)
-    labels = dict(zip(ids, panel.units().tolist(), strict=True))
-    members: dict[str, list[str]] = {}
-    for scenario in sorted(chosen):
-        # One that nobody here was run on has no row that says its cluster: it is a unit that never comes.
-        members.setdefault(labels.get(scenario, f"scenario:{scenario}"), []).append(scenario)
+    place = {s.id: n for n, s in enumerate(panel.scenarios)}
+    members = plan.members
     counts = panel.trials[[a, b]]
-    needed = [trials or _usual(counts[0]), 1 if trials else _usual(counts[1])]
-    there = {
-        i for n, i in enumerate(ids) if i in chosen and (counts[:, n] >= needed).all() and counts[:, n].all()
-    }
-    test = SequentialTest(
-        len(members), grid_of(counts[counts > 0].tolist()), level if planned_level is None else planned_level
-    )
-    place = {i: n for n, i in enumerate(ids)}
+    needed = np.maximum(plan.trials, 1)
+    there = {i for i in plan.units if i in place and (counts[:, place[i]] >= needed).all()}
+    grid = grid_of(plan.trials if min(plan.trials) > 0 else counts[counts > 0].tolist())
+    test = SequentialTest(len(members), grid, level if planned_level is None else planned_level)
     for unit in whole_units(sequence(members), members, there):
         index = [place[i] for i in members[unit]]
         test.add(float((panel.rates[a, index] - panel.rates[b, index]).sum()), len(index))
@@ -69,12 +58,6 @@ def watched_pair(
         WORDS[panel.unit()],
         sequential=True,
     )
-
-
-def _usual(counts: np.ndarray) -> int:
-    """Trials that most scenarios have, of those with any."""
-    values, often = np.unique(counts[counts > 0], return_counts=True)
-    return int(values[often.argmax()]) if len(values) else 1
 
 
 def recorded_pairs(

@@ -25,15 +25,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the logs are still growing, and looked at more than once: p and interval hold at every look",
     )
+    parser.add_argument(
+        "--scenarios",
+        help="with --sequential: the set that the runs were to evaluate (shipped name, folder, Hub id) where "
+        "the logs do not name all of it yet",
+    )
+    parser.add_argument("--revision", help="commit, tag or branch of that set on the Hub")
+    parser.add_argument("--select", default="", help="the runs' --env.select")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the comparison."""
     from lerobot_roborecover.analysis.compare import compare, to_json, to_screen
+    from lerobot_roborecover.analysis.estimators import RowsError
     from lerobot_roborecover.analysis.logs import read_study
+    from lerobot_roborecover.analysis.sequential_plan import planned_units
 
-    options = replace(analysis_options(args), sequential=args.sequential)
-    found = compare(read_study(args.logs, args.platform), args.a, args.b, options)
+    if args.scenarios and not args.sequential:
+        raise RowsError(
+            f"--scenarios {args.scenarios} says what --sequential plans for; give both or neither"
+        )
+    study, planned = read_study(args.logs, args.platform), None
+    if args.scenarios:
+        planned = planned_units(study, args.scenarios, args.revision, args.select)
+    options = replace(analysis_options(args), sequential=args.sequential, planned=planned)
+    found = compare(study, args.a, args.b, options)
     print(json.dumps(to_json(found), indent=1) if args.json else to_screen(found))
     return 0

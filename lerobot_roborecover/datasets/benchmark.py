@@ -25,7 +25,8 @@ FRAMEWORK = "roborecover"
 TASKS = {
     "recovery_success_rate": "recovery success rate (RSR), per cent: from recovery points, every scenario "
     "weighing the same",
-    "macro_recovery_success_rate": "mean over cells of stage and deviation type, per cent",
+    "macro_recovery_success_rate": "mean over the cells of stage and deviation type that are large enough, "
+    "per cent",
     "initial_state_success_rate": "the same tasks from their initial states, per cent",
 }
 """Ids of the results that a model's `.eval_results/` gives, and what each is."""

@@ -45,6 +45,11 @@ class Reference:
     trials: tuple[int, ...]
     """How many a scenario has; each number that occurs."""
 
+    def outcomes(self) -> str:
+        """SHA-256 of its rates: a log that grows between two looks would change what has counted."""
+        text = "\n".join(f"{name} {rate!r}" for name, rate in sorted(self.rates.items()))
+        return hashlib.sha256(text.encode()).hexdigest()
+
 
 def read_reference(path: Path, scenarios: Sequence[Scenario], protocol: Protocol) -> Reference:
     """Reads the log that a run is to be compared with.
@@ -134,6 +139,7 @@ class Watch(Tally):
             [""] * len(scenarios),
             [s.first_state_sha256() for s in scenarios],
         )
+        self._unit_of = dict(zip([s.id for s in scenarios], labels.tolist(), strict=True))
         self._members: dict[str, list[Scenario]] = {}
         for label, scenario in zip(labels.tolist(), scenarios, strict=True):
             self._members.setdefault(label, []).append(scenario)
@@ -230,6 +236,8 @@ class Watch(Tally):
                 after_scenarios=self._taken_at,
                 p=self._test.p if self._test.steps else None,
                 words=self.words,
+                units=tuple(self._unit_of[s.id] for s in self.order),
+                against_outcomes=self._reference.outcomes(),
             ),
         )
 
@@ -257,14 +265,26 @@ def open_watch(
     reference = read_reference(path, chosen, protocol)
     if log.exists() and reference.path.resolve() == log.resolve():
         raise OptionError(f"--sequential={value}: this is the run's own log; name another policy's")
-    _check_same_question(log, reference)
+    _check_same_question(log, reference, {s.id for s in chosen}, trials)
     return Watch(chosen, protocol, trials, reference)
 
 
-def _check_same_question(log: Path, reference: Reference) -> None:
+def _check_same_question(log: Path, reference: Reference, scenarios: set[str], trials: int) -> None:
+    """Refuses another comparison, or another plan, than that of the first look."""
     before = read_record(log)
-    if before is not None and before.against_config_hash != reference.config_hash:
+    if before is None:
+        return
+    begun = f"--sequential={reference.path}: {log} was begun as a comparison with {before.against}"
+    if before.against_config_hash != reference.config_hash:
+        raise OptionError(f"{begun}, and one run answers one question. Give this run another --output_dir")
+    if set(before.scenarios) != scenarios or before.trials != trials:
         raise OptionError(
-            f"--sequential={reference.path}: {log} was begun as a comparison with {before.against}, and one "
-            "run answers one question. Give this run another --output_dir"
+            f"{begun} on {len(before.scenarios)} scenarios with {before.trials} trials each, and not on "
+            f"{len(scenarios)} with {trials}: the plan is fixed at the first look. Take the same "
+            "--env.select and --eval.n_episodes, or another --output_dir"
+        )
+    if before.against_outcomes and before.against_outcomes != reference.outcomes():
+        raise OptionError(
+            f"{begun}, whose outcomes have changed since. Bring back the log as it was, or give this run "
+            "another --output_dir"
         )

@@ -22,7 +22,8 @@ def metrics_of(rows: Sequence[TrialRow]) -> dict[str, float]:
         By start (`recovery/`, `initial/`, `reversion/`): `success`, in which every scenario weighs the same;
         `success_low` and `success_high`, its 95 % interval, where there are scenarios enough for one;
         `trials`; `invalid`, those of them that count as failures because something broke. From recovery
-        points also `macro`, in which every cell weighs the same, and `cell/<cell>`.
+        points also `macro`, in which every cell that is large enough weighs the same, `macro9` over the
+        paper's nine cells, where all are there, and `cell/<cell>`.
     """
     found: dict[str, float] = {}
     for start, part in summarise([asdict(r) for r in rows]).starts.items():
@@ -34,7 +35,7 @@ def metrics_of(rows: Sequence[TrialRow]) -> dict[str, float]:
             "invalid": sum(part.invalid.values()),
         }
         if start.value == "recovery":
-            own["macro"] = part.macro.value
+            own |= {"macro": part.macro.value, "macro9": part.macro9.value}
             own |= {f"cell/{cell.cell.replace(' ', '_')}": cell.estimate.value for cell in part.cells}
         found |= {f"{start.value}/{key}": float(value) for key, value in own.items()}
     return {key: value for key, value in found.items() if not math.isnan(value)}

@@ -145,7 +145,8 @@ def test_summary_keeps_starts_apart():
     recovery = summary.starts[Start.RECOVERY]
     assert (recovery.scenarios, recovery.trials) == (3, 10)
     assert recovery.rsr.value == pytest.approx(7 / 12)
-    assert recovery.macro.value == pytest.approx(0.5)
+    assert math.isnan(recovery.macro.value), "two cells of two and of one scenario are no Macro"
+    assert recovery.macro_cells.left_out == ("Approach-Wrong Pose", PLACE)
     assert [(c.cell, c.scenarios, c.trials) for c in recovery.cells] == [
         ("Approach-Wrong Pose", 2, 6),
         (PLACE, 1, 4),
@@ -161,9 +162,13 @@ def test_table():
     assert lines[3].split() == ["Initial-state", "success", "66.7", "[4.6,", "99.0]", "3", "3", "0"]
     assert lines[4].split()[:4] == ["Recovery", "success", "(RSR)", "58.3"]
     assert lines[4].split()[-3:] == ["3", "10", "2"]
-    assert lines[5].startswith("Macro over 2 cells")
-    assert lines[-5].split() == ["Place-Scene", "Change", "*", "25.0", "n/a", "1", "4"]
-    assert lines[-4].startswith("* fewer than 10 scenarios")
+    assert lines[5].split() == ["Macro-9", "n/a"]
+    assert lines[-7].split() == ["Place-Scene", "Change", "*", "25.0", "n/a", "1", "4"]
+    assert lines[-6].startswith("* fewer than 10 scenarios")
+    assert lines[-5] == (
+        "Left out of Macro, with fewer than 7 scenarios: Approach Wrong Pose (2), Place Scene Change (1)."
+    )
+    assert lines[-4].startswith("Macro-9 is not defined: no scenario in 7 of the paper's nine cells (")
     assert lines[-2].endswith("counted as failures: 1 sim_error, 1 state_mismatch")
     assert lines[-1].startswith("Without those that infrastructure ended: ")
     assert len({len(line.rstrip()) for line in lines[3:5]}) == 1

@@ -149,10 +149,50 @@ def test_too_far_says_what_misses(benchmark):
 
 
 def test_nothing_is_certain_from_few_scenarios():
-    assert rate_interval(spread(np.ones(2)))[0] < 0.05
+    assert rate_interval(spread(np.ones(2)))[0] < 0.2
     low, high = rate_interval(spread(np.zeros(20)))
     assert (low, 0.1 < high < 0.3) == (0, True)
     assert rate_interval(spread(np.full(64, 1.0)))[1] == 1
+
+
+@pytest.mark.parametrize(("successes", "n"), [(2, 2), (0, 6), (0, 20), (9, 9), (0, 359)])
+@pytest.mark.parametrize("level", [0.95, 0.8])
+def test_a_group_without_success_or_without_failure_has_the_exact_interval(successes, n, level):
+    exact = stats.binomtest(successes, n).proportion_ci(level, "exact")
+    found = rate_interval(spread(np.full(n, successes / n)), level)
+    assert found == pytest.approx((exact.low, exact.high))
+
+
+def test_the_exact_interval_counts_independent_units_not_scenarios():
+    labels = [f"c{i // 3}" for i in range(18)]
+    exact = stats.binomtest(0, 6).proportion_ci(method="exact")
+    assert rate_interval(spread(np.zeros(18), labels)) == pytest.approx((exact.low, exact.high))
+
+
+def test_no_rates_of_unequal_units_make_a_run_of_failures_likelier_than_its_bound_says():
+    """The bound is the largest mean rate at which all units fail with chance .025, found here by search."""
+    weights = np.array([0.5, 0.25, 0.25])
+    fail = np.linspace(0.025, 1, 300)
+    first, second = np.meshgrid(fail, fail)
+    third = 0.025 / (first * second)
+    means = 1 - np.tensordot(weights, [first, second, third], 1)
+    searched = means[third <= 1].max()
+    bound = rate_interval(spread(np.zeros(4), list("aabc")))[1]
+    assert searched <= bound + 1e-9
+    assert bound == pytest.approx(searched, abs=1e-3)
+
+
+@pytest.mark.parametrize("scatter", [0.3, 1.0, 1e9])
+@pytest.mark.parametrize("trials", [1, 5])
+def test_few_scenarios_without_success_are_covered_however_they_scatter(scatter, trials):
+    rng = np.random.default_rng(0)
+    for n in (2, 4, 8):
+        for p in (0.05, 0.3, 0.6):
+            rates = rng.beta(p * scatter, (1 - p) * scatter, (2000, n))
+            y = rng.binomial(trials, rates) / trials
+            low, high = rate_interval(spread(y))
+            missed = ((high < p) & (y == 0).all(1)) | ((low > p) & (y == 1).all(1))
+            assert missed.mean() <= 0.025 + 3 * math.sqrt(0.025 / 2000)
 
 
 def test_hand_worked_intervals():

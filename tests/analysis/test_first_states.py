@@ -17,6 +17,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.ranking import pairs_from_both_starts
 from lerobot_roborecover.analysis.report_tables import initial_estimates, overall
 from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
@@ -188,3 +189,15 @@ def test_clean_rollouts_of_one_first_state_make_one_threshold():
 def test_a_plan_says_how_many_first_states_a_set_has(capsys):
     assert main(["plan", "--rate", "50", "--scenarios", "metaworld_study", "--split", "test"]) == 0
     assert "57 first states" in capsys.readouterr().err
+
+
+def test_scenarios_that_share_a_hard_first_state_are_no_trials_until_success(tmp_path):
+    """More scenarios at first states that are not solved: nobody retried anything."""
+    rows = []
+    for state in range(40):
+        for copy in range(1 if state % 2 else 4):
+            common = {"policy": "a", "first_state": f"{state:064x}"}
+            for start, success in (("initial", state % 2 == 1), ("recovery", copy % 2 == 0)):
+                rows.append(trial_row(100 * copy + state, success=success, start=start, **common))
+    found = analyse(read_study([str(write_log(tmp_path / "log.jsonl", rows))]), QUICK)
+    assert barred_arms(found.initial) == {}

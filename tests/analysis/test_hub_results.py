@@ -28,8 +28,8 @@ def made(tmp_path, **groups):
 
 
 def test_hub_metadata(tmp_path):
-    rows = policy_rows("a", 12, 2, 0.5, 0, **ON_HUB) + policy_rows(
-        "a", 12, 2, 0.9, 1, start="initial", **ON_HUB
+    rows = policy_rows("a", 28, 2, 0.5, 0, **ON_HUB) + policy_rows(
+        "a", 28, 2, 0.9, 1, start="initial", **ON_HUB
     )
     found = made(tmp_path, a=rows)
     board, entry = find_entry(found, None)
@@ -43,7 +43,7 @@ def test_hub_metadata(tmp_path):
         "revision": "c0ffee",
     }
     assert data[0]["value"] == pytest.approx(100 * entry.rsr.value, abs=0.006)
-    assert "12 scenarios, 24 trials, 0 invalid" in data[0]["notes"]
+    assert "28 scenarios, 56 trials, 0 invalid" in data[0]["notes"]
     assert "revision" not in yaml.safe_load(results_yaml(board, entry, "other/set"))[0]["dataset"]
     assert file_name(board) == ".eval_results/roborecover-org-scenarios-c0ffee-test.yaml"
 
@@ -74,7 +74,7 @@ def test_the_source_and_the_date(tmp_path):
 
 
 def test_how_results_compare(tmp_path):
-    local = made(tmp_path, a=policy_rows("me/a@1", 20, 2, 0.5, 0, **ON_HUB))
+    local = made(tmp_path, a=policy_rows("me/a@1", 28, 2, 0.5, 0, **ON_HUB))
     (entry,) = local.boards[0].entries
     rate, rsr = round(100 * entry.rsr.value, 2), "recovery_success_rate"
     results = [
@@ -112,7 +112,7 @@ def test_one_source_a_result(tmp_path, capsys):
 @pytest.mark.slow
 def test_results_are_offered_and_read_back(hub, tmp_path):
     """The real client against a server on loopback, from a process whose Hub is that server."""
-    write_log(tmp_path / "logs" / "a.jsonl", policy_rows("a", 6, 2, 0.5, 0, **ON_HUB))
+    write_log(tmp_path / "logs" / "a.jsonl", policy_rows("a", 28, 2, 0.5, 0, **ON_HUB))
     hub.repos["me/model"], hub.repos["org/scenarios"] = repo, board = Repo(), Repo()
     before = repo.commit({"README.md": b"# My model"})
     board.commit({"README.md": b"no benchmark"})

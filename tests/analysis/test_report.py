@@ -219,7 +219,7 @@ def test_all_successes_and_all_failures(tmp_path, success):
     rsr = by_policy(table(results, "overall"))["a"]["RSR %"]
     assert rsr.value == success
     assert (rsr.low, rsr.high) == (
-        (pytest.approx(0.668, abs=1e-3), 1) if success else (0, pytest.approx(0.332, abs=1e-3))
+        (pytest.approx(0.735, abs=1e-3), 1) if success else (0, pytest.approx(0.265, abs=1e-3))
     )
     paper = by_policy(table(results, "overall"))["a"]["RSR % (percentile bootstrap, as in the paper)"]
     assert (paper.low, paper.high) == (success, success)

@@ -12,7 +12,7 @@ import pytest
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.headline import headline
-from lerobot_roborecover.analysis.intervals import difference_interval, difference_p, spread
+from lerobot_roborecover.analysis.intervals import difference_interval, difference_p, rate_interval, spread
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.leaderboard_page import board_table
 from lerobot_roborecover.analysis.logs import read_study
@@ -45,6 +45,13 @@ def method(tmp_path, name, rates, count=40, trials=2, **changes):
 
 def table(results, name):
     return next(t for t in all_tables(results) if t.name == name)
+
+
+def test_runs_without_a_success_say_as_much_of_other_runs_as_their_number():
+    """Scenarios of one run share its weights: three runs of twenty scenarios are three, not twenty."""
+    for runs, scenarios in ((3, 20), (10, 6)):
+        found = rate_interval(crossed_spread(np.zeros((runs, scenarios)), resample(np.arange(scenarios))))
+        assert found == pytest.approx((0, 1 - 0.025 ** (1 / min(runs, scenarios))))
 
 
 def test_commas_and_equals_in_paths(tmp_path, monkeypatch):

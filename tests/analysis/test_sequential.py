@@ -4,8 +4,9 @@ stops, and what a report makes of its log."""
 from __future__ import annotations
 
 import json
+import math
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
@@ -14,18 +15,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.logs import Study, read_study
+from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
 from lerobot_roborecover.analysis.sequential_record import read_record, record_path
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
+from lerobot_roborecover.analysis.watched import watched_pair
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
 from lerobot_roborecover.env.run import PlatformPart, open_run
 from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.local import LocalEngine
 from lerobot_roborecover.trials.sequential import ALONE, open_watch
@@ -290,8 +297,12 @@ def test_a_report_knows_a_run_that_stopped(stopped, dataset, tmp_path):
     assert (entry.stopped, entry.place) == (True, None)
 
 
+def growing(policy, count, rate, seed, trials=2, **changes):
+    return policy_rows(policy, count, trials, rate, seed, run_scenarios=count, run_trials=trials, **changes)
+
+
 def test_compare_sequential_counts_scenarios_in_their_turn(tmp_path, capsys):
-    rows = {p: policy_rows(p, 30, 2, rate, 0) for p, rate in (("a", 0.95), ("b", 0.05))}
+    rows = {p: growing(p, 30, rate, 0) for p, rate in (("a", 0.95), ("b", 0.05))}
     names = sequence(f"scenario:{r.scenario_id}" for r in rows["a"])
     order = [name.removeprefix("scenario:") for name in names]
     first = [r for r in rows["a"] if r.scenario_id in order[:12]]
@@ -306,6 +317,111 @@ def test_compare_sequential_counts_scenarios_in_their_turn(tmp_path, capsys):
     write_log(tmp_path / "a.jsonl", later)
     assert main(["compare", *logs, "--sequential"]) == 2
     assert "no scenario's turn has come" in capsys.readouterr().err
+
+
+LOOKS, PLANNED = 10, 40
+
+
+def first_looks(rows):
+    """Ten looks at two logs that grow in the order of the set: rows of both so far."""
+    for look in range(1, LOOKS + 1):
+        there = {f"s{n:03d}" for n in range(look * PLANNED // LOOKS)}
+        yield [[r for r in own if r.scenario_id in there] for own in rows]
+
+
+def test_ten_looks_at_two_growing_logs_err_within_the_level():
+    """A plan made of the scenarios that were there erred in 19 % [13, 27] of such comparisons."""
+    planned = {f"s{n:03d}": f"scenario:s{n:03d}" for n in range(PLANNED)}
+    options, count = Options(draws=100, sequential=True, planned=planned), 60
+    wrong = unplanned = 0
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        rows = [growing(p, PLANNED, 0.5, rng.integers(2**31), trials=1) for p in "ab"]
+        found, grown = [], []
+        for now in first_looks(rows):
+            arms = tuple(Arm(r[0].policy, Start.RECOVERY, (0,), tuple(r)) for r in now)
+            found.append(analyse(Study("libero", arms, (), ()), options).contrast("a", "b"))
+            panel = make_panel(arms)
+            there = dict(zip([s.id for s in panel.scenarios], panel.units().tolist(), strict=True))
+            grown.append(watched_pair(panel, (0, 1), 0.95, SequentialPlan(there, (1, 1))))
+        wrong += any(c.verdict.separated for c in found)
+        unplanned += any(c.p < 0.05 and c.differing >= LEAST_DIFFERING for c in grown)
+    bound = 0.05 + 2 * math.sqrt(0.05 * 0.95 / count)
+    assert wrong / count <= bound < unplanned / count
+
+
+def test_looks_without_the_planned_set_are_refused(tmp_path, capsys):
+    rows = {p: growing(p, 30, 0.5, n) for n, p in enumerate("ab")}
+    part = {p: [r for r in own if int(r.scenario_id[1:]) < 20] for p, own in rows.items()}
+    old = {p: [replace(r, run_scenarios=None, run_trials=None) for r in own] for p, own in rows.items()}
+
+    def refused(groups, *options):
+        logs = [str(write_log(tmp_path / f"{p}.jsonl", own)) for p, own in groups.items()]
+        assert main(["compare", *logs, "--sequential", *options]) == 2
+        return capsys.readouterr().err
+
+    told = refused(part)
+    assert (
+        "the runs were to evaluate 30, and the logs name 20 so far. Name the set: --scenarios made-up" in told
+    )
+    assert "the logs, of an earlier version, do not say how many" in refused(old)
+    no_trials = {p: [replace(r, run_trials=None) for r in own] for p, own in rows.items()}
+    assert "the rows of b do not say them. Say them: --trials K" in refused({**rows, "b": no_trials["b"]})
+    two_plans = {**rows, "b": [replace(r, run_scenarios=25) for r in rows["b"]]}
+    assert "the runs were to evaluate 25 and 30 scenarios" in refused(two_plans)
+    more = {**rows, "a": [*rows["a"], replace(rows["a"][0], trial=2)]}
+    assert "a has 3 trials of s000, and 2 were planned" in refused(more)
+    assert not record_path(tmp_path / "a.jsonl").exists(), "no look has been taken"
+
+
+def test_the_plan_of_the_first_look_holds_for_the_next(tmp_path, capsys):
+    """The set is named at the first look; the next one takes it from the record, and no other."""
+    folder = fake_dataset(tmp_path / "set", 12)
+    chosen = load_scenarios(str(folder))
+    rows = {
+        p: [
+            replace(
+                r, scenario_id=s.id, scenario_sha256=s.sha256(), platform="fake", cluster="",
+                split=s.labels.split, run_scenarios=12, run_trials=2,
+            )
+            for n, s in enumerate(chosen)
+            for r in policy_rows(p, 1, 2, rate, n)
+        ]
+        for p, rate in (("a", 0.9), ("b", 0.1))
+    }  # fmt: skip
+    half = {p: own[:12] for p, own in rows.items()}
+    logs = [str(write_log(tmp_path / f"{p}.jsonl", own)) for p, own in half.items()]
+    assert main(["compare", *logs, "--sequential"]) == 2
+    assert "logs name 6 so far" in capsys.readouterr().err
+    assert main(["compare", *logs, "--sequential", "--scenarios", str(folder)]) in (0, 2)
+    record = read_record(tmp_path / "a.jsonl")
+    assert set(record.scenarios) == set(chosen.ids)
+    assert (record.trials, record.against_trials) == (2, 2)
+    for p, own in rows.items():
+        write_log(tmp_path / f"{p}.jsonl", own)
+    assert main(["compare", *logs, "--sequential"]) == 0
+    later = read_record(tmp_path / "a.jsonl")
+    assert later.scenarios == record.scenarios
+    assert later.after_scenarios > record.after_scenarios
+    assert analyse(read_study(logs)).contrast("a", "b").sequential, "a report knows that it was looked at"
+    capsys.readouterr()
+    other = fake_dataset(tmp_path / "other", 14)
+    assert main(["compare", *logs, "--sequential", "--scenarios", str(other)]) == 2
+    assert "plan is fixed at the first look" in capsys.readouterr().err
+
+
+def test_a_run_keeps_the_plan_that_it_began_with(stopped, dataset, tmp_path):
+    """The same log with more scenarios or trials would be another plan, and its looks would add up."""
+    root, _, _ = stopped
+    shutil.copytree(root / "push", tmp_path / "push")
+    log = tmp_path / "push" / "trials.jsonl"
+    record = json.loads(record_path(log).read_text())
+    record_path(log).write_text(json.dumps({**record, "scenarios": record["scenarios"][:5], "units": []}))
+    with pytest.raises(OptionError, match="on 5 scenarios with 2 trials each, and not on 12 with 2"):
+        evaluate(dataset, log, "push@1", PushHost(), str(root / "lazy"))
+    record_path(log).write_text(json.dumps({**record, "against_outcomes": "0" * 64}))
+    with pytest.raises(OptionError, match="whose outcomes have changed since"):
+        evaluate(dataset, log, "push@1", PushHost(), str(root / "lazy"))
 
 
 @pytest.mark.parametrize(
