@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -237,7 +238,9 @@ def _heat_map(
 
 def paired_differences(results: Results) -> Figure:
     """All pairs with their intervals; separated ones filled."""
-    found = sorted(results.contrasts, key=lambda c: c.difference.value)
+    pairs = set(results.shown_pairs)
+    every = zip(combinations(range(len(results.recovery.arms)), 2), results.contrasts, strict=True)
+    found = sorted((c for pair, c in every if pair in pairs), key=lambda c: c.difference.value)
     shown = [c for c in found if not math.isnan(c.difference.value)]
     level = f"{100 * results.draws.level:g} % interval"
 
@@ -264,4 +267,9 @@ def paired_differences(results: Results) -> Figure:
 
     clear = [c for c in shown if c.verdict.separated]
     text = f"{len(clear)} of {len(shown)} pairs are separated after adjustment for their number (Holm)."
+    if len(shown) < len(results.contrasts):
+        text = (
+            f"{results.recovery.arms[0]} against every other policy: {text} The table has all "
+            f"{len(results.contrasts)} pairs."
+        )
     return Figure("paired_differences", "Paired differences in RSR", text, *both(draw))

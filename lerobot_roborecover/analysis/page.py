@@ -55,15 +55,25 @@ def render_page(
     )
 
 
-def picture(figure: Figure) -> dict[str, str]:
-    """A figure as the templates show it: drawings as data URIs, title and words."""
-    narrow = _uri(svg_of(figure.narrow)) if figure.narrow is not None else ""
+def picture(figure: Figure, drawn: tuple[bytes, bytes | None] | None = None) -> dict[str, str]:
+    """A figure as the templates show it: drawings as data URIs, title and words.
+
+    Args:
+        figure: to show.
+        drawn: its SVG, wide and narrow, where they are drawn already.
+    """
+    wide, narrow = drawn or drawn_as_svg(figure)
     return {
-        "uri": _uri(svg_of(figure.plot)),
-        "narrow": narrow,
+        "uri": _uri(wide),
+        "narrow": "" if narrow is None else _uri(narrow),
         "title": figure.title,
         "text": figure.description,
     }
+
+
+def drawn_as_svg(figure: Figure) -> tuple[bytes, bytes | None]:
+    """A figure's SVG, wide and, where there is one, narrow."""
+    return svg_of(figure.plot), None if figure.narrow is None else svg_of(figure.narrow)
 
 
 def grouped(remarks: Sequence[str], heads: Sequence[str]) -> Mapping[str, list[str]]:

@@ -16,10 +16,10 @@ from lerobot_roborecover.analysis.figures import all_figures
 from lerobot_roborecover.analysis.gallery import Card, TrialVideo, gallery_values, make_cards
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.page import grouped, picture, render_page
+from lerobot_roborecover.analysis.page import drawn_as_svg, grouped, picture, render_page
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.style import png_of, svg_of
+from lerobot_roborecover.analysis.style import png_of
 from lerobot_roborecover.analysis.tables import Cell, Table, to_csv, to_latex, to_markdown
 from lerobot_roborecover.analysis.units import ESTIMAND
 from lerobot_roborecover.whole import write_whole
@@ -97,11 +97,12 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
     remarks = [*results.remarks, *extras.remarks]
     images: dict[str, dict[str, str]] = {}
     for figure in all_figures(results):
-        write_whole(out / "figures" / f"{figure.name}.svg", svg_of(figure.plot))
+        wide, narrow = drawn_as_svg(figure)
+        write_whole(out / "figures" / f"{figure.name}.svg", wide)
         write_whole(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
-        if figure.narrow is not None:
-            write_whole(out / "figures" / f"{figure.name}_narrow.svg", svg_of(figure.narrow))
-        images[figure.name] = picture(figure)
+        if narrow is not None:
+            write_whole(out / "figures" / f"{figure.name}_narrow.svg", narrow)
+        images[figure.name] = picture(figure, (wide, narrow))
     for table in tables:
         write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
         write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())

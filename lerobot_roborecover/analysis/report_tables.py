@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from itertools import combinations
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
@@ -220,7 +219,7 @@ def profiles(results: Results) -> Table:
     """Profile difference of every pair: cross-fitted, in hindsight, and by chance alone."""
     panel, draws = results.recovery, results.draws
     rows = []
-    for a, b in combinations(range(len(panel.arms)), 2):
+    for a, b in results.shown_pairs:
         w = profile_difference(panel, a, b, draws)
         rows.append(
             (panel.arms[a], panel.arms[b], w.difference, w.hindsight, w.floor, w.higher, w.lower, w.equal)
@@ -236,6 +235,11 @@ def profiles(results: Results) -> Table:
         "for policies that are alike. As observed: mean absolute difference, which noise makes larger than "
         "zero. By chance alone: what that would be were the two alike (mean, and what 95 % of random deals "
         "of the trials show).",
+        *(
+            (f"Only {panel.arms[0]} against every other policy, of {len(results.contrasts)} pairs.",)
+            if len(rows) < len(results.contrasts)
+            else ()
+        ),
     )
     return Table("profiles", "Profile differences", columns, tuple(rows), notes)
 

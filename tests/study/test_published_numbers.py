@@ -10,6 +10,7 @@ import pytest
 from lerobot_roborecover.analysis.gain_tables import task_gains
 from lerobot_roborecover.analysis.gains import gains_by_group, groups_by_driver
 from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.macro import macro_9_estimates, macro_estimates
 from lerobot_roborecover.analysis.ranking import pairs_from_both_starts, rank_agreement
 from lerobot_roborecover.analysis.report_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Options, Results, analyse
@@ -57,11 +58,18 @@ def shown(estimate, kind: str = "percent") -> str:
     return cell_text(estimate, Column("", kind))
 
 
+def macros_of(found: Results) -> list[list[str]]:
+    """Both Macro numbers of every policy as the pages have them: without an interval where there is none."""
+    both = macro_estimates, macro_9_estimates
+    columns = [[shown(e).replace(" [n/a]", "") for e in of(found.recovery, found.draws)] for of in both]
+    return [list(texts) for texts in zip(*columns, strict=True)]
+
+
 @pytest.mark.parametrize("results", PAGES, indirect=True)
 def test_every_policy_s_row_is_that_of_the_stored_outcomes(results):
     name, found = results
     initial = initial_estimates(found)
-    rsr = found.draws.rates(found.recovery.rates.T)
+    rsr, macros = found.draws.rates(found.recovery.rates.T), macros_of(found)
     for page in PAGES[name]:
         rows = cells(page)
         for p, policy in enumerate(found.recovery.arms):
@@ -71,6 +79,8 @@ def test_every_policy_s_row_is_that_of_the_stored_outcomes(results):
             assert all(wanted[1] in row for row in own)
             if page != "README.md":
                 assert all(shown(found.retention[p], "ratio") in row for row in own)
+            if name != "metaworld_recovery":  # whose tables have no Macro
+                assert all(text in row for text in macros[p] for row in own)
 
 
 @pytest.mark.parametrize("results", ["metaworld_recovery", "libero"], indirect=True)
