@@ -7,12 +7,12 @@
 
 Made-up policies with known rates: n scenarios of equal difficulty, or beta-distributed ones (concentration 4
 and 1, a little and much scatter), 1 or 5 trials each, rates from .02 to .98; with and without tasks, whose
-rates scatter too; monitors whose scenarios are hard and easy; annotators who err. Each interval is held
-against its own estimand: scenarios like these of these tasks, or tasks like these. Exit status 1 where an
-interval covers below 90 % at n = 8 or below 92 % from n = 20 on, or a family of 15 pairs is wrong more often
-than 6 %. Seeded; every setting has draws of its own. What takes long is measured on fewer samples: a fourth
-of --replicates for what is cross-fitted, an eighth for monitors (a sixteenth at n = 200), a sixteenth for
-rank inversions, runs of a method and tests that are looked at.
+rates scatter too; scenarios that share first states; monitors whose scenarios are hard and easy; annotators
+who err. Each interval is held against its own estimand: scenarios like these of these tasks, or tasks like
+these. Exit status 1 where an interval covers below 90 % at n = 8 or below 92 % from n = 20 on, or a family of
+15 pairs is wrong more often than 6 %. Seeded; every setting has draws of its own. What takes long is measured
+on fewer samples: a fourth of --replicates for what is cross-fitted, an eighth for monitors (a sixteenth at
+n = 200), a sixteenth for rank inversions, runs of a method and tests that are looked at.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ if __name__ == "coverage":
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import coverage_first_states as shared
 import coverage_labels as labels
 import coverage_runs as several
 import coverage_settings as settings
@@ -50,6 +51,7 @@ PARTS = {
     "looks": several.looks,
     "ranks": settings.ranks,
     "tests": settings.tests,
+    "first_states": shared.first_states,
     "bootstrap": settings.bootstrap,
 }
 NOT_PRINTED = (
@@ -58,6 +60,8 @@ NOT_PRINTED = (
     "rate, hierarchical bootstrap",
     "the same, from these runs alone",
     "a fixed test at every look",
+    "initial rate, over scenarios",
+    "one initial pair, over scenarios",
     "the same, planned for what is there",
 )
 """For comparison: no target."""

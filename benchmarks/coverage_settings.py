@@ -25,7 +25,7 @@ from lerobot_roborecover.analysis.intervals import (
 )
 from lerobot_roborecover.analysis.macro import LEAST_IN_CELL
 from lerobot_roborecover.analysis.panel import Panel, ScenarioLabels
-from lerobot_roborecover.analysis.ranking import rank_agreement
+from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
 
@@ -379,7 +379,8 @@ def ranks(replicates: int) -> Iterator[Line]:
                 bounds, bootstrapped = [], []
                 for _ in range(count):
                     x, y = (rng.binomial(k, p[:, None], (POLICIES, n)) / k for p in orders)
-                    found = rank_agreement(x, y, "abcdef", draws).inversions
+                    rates = (StartRates(tuple("abcdef"), values, draws) for values in (x, y))
+                    found = rank_agreement(*rates).inversions
                     bounds.append((found.low, found.high))
                     drawn = _rho(draws.means(x.T), draws.means(y.T))
                     # Rounding: a coefficient is one of few fractions.

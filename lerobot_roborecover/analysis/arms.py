@@ -119,8 +119,9 @@ def arm_of(policy: str, start: Start, runs: Mapping[str, Sequence[TrialRow]]) ->
                     f"{next(iter(runs))}, {getattr(first, what)} in {run}. Runs of one method differ in "
                     "weights and seed alone; give them names of their own (NAME=LOG)"
                 )
-        ours, theirs = (settings_of_method(row.policy_settings) for row in (firsts[0], first))
-        if ours != theirs and first.first_state and firsts[0].first_state:
+        ours, theirs = (settings_of_method(row.policy_settings or {}) for row in (firsts[0], first))
+        recorded = first.policy_settings is not None and firsts[0].policy_settings is not None
+        if ours != theirs and recorded:
             raise RowsError(
                 f"{policy}: its runs differ in the policy's settings: {settings_differences(ours, theirs)} "
                 f"({next(iter(runs))} / {run}). Runs of one method differ in weights and seed alone; give "
@@ -168,7 +169,7 @@ def _differences(first: TrialRow, second: TrialRow) -> str:
         if getattr(first, f) != getattr(second, f)
     ]
     if first.policy_settings != second.policy_settings:
-        differences = settings_differences(first.policy_settings, second.policy_settings)
+        differences = settings_differences(first.policy_settings or {}, second.policy_settings or {})
         found.append(f"the policy's settings ({differences})")
     return ", ".join(found) or "the evaluation's options (see the rows' config_hash)"
 

@@ -3,8 +3,9 @@
 Of n clean rollouts that nothing else was chosen on, each has its highest score. The k-th smallest of these,
 k = ceil((n + 1) (1 - alpha)), is passed by the highest score of one more such rollout with probability at
 most alpha, whatever the detector and however the scores are distributed (Vovk et al. 2005; Lei et al. 2018),
-as long as the rollouts are exchangeable. With fewer than 1 / alpha - 1 rollouts nothing can be promised, and
-the threshold is infinite.
+as long as the rollouts are exchangeable: one of each first state, since a deterministic policy does the same
+from the same first state. With fewer than 1 / alpha - 1 rollouts nothing can be promised, and the threshold
+is infinite.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ class Contrast:
     p_holm: float
     """The same after Holm's adjustment for all contrasts of the family; NaN for one outside of it."""
     scenarios: int
+    """From initial states: first states."""
     units: int
-    """Units of those scenarios: scenarios, trajectory clusters, or tasks."""
+    """Units of those scenarios: scenarios, trajectory clusters, first states, or tasks."""
     differing: int
     """Units on which the two differ."""
     family: int

@@ -32,7 +32,7 @@ class ScoredTrial:
 
     scenario: str
     unit: str
-    """What is independent: the scenario's cluster, or the scenario."""
+    """Label of what is independent: the first state, which scenarios share that branch off from it."""
     start: str
     """`recovery`, or `initial`: a clean rollout."""
     trial: int
@@ -80,9 +80,10 @@ class Alarms:
     threshold: tuple[float, ...]
     """Of either half of the scenarios; empty for the detector's own decisions."""
     clean: int
-    """Successful clean rollouts."""
+    """First states with a successful clean rollout."""
     clean_alarmed: Estimate
-    """Share of them with an alarm: what the conformal threshold holds down."""
+    """Share of clean rollouts with an alarm, each first state weighing the same: what the conformal threshold
+    holds down."""
     alarms_per_minute: Estimate
     """Alarms that begin in them, a minute of robot time."""
     detected: Estimate
@@ -192,18 +193,18 @@ def alarms(
     clean = [(t, f) for t, f in zip(trials, fired, strict=True) if t.clean]
     deviated = [(t, f) for t, f in zip(trials, fired, strict=True) if t.start == "recovery"]
 
-    def share(chosen: list[tuple[ScoredTrial, np.ndarray]]) -> Estimate:
+    def share(chosen: list[tuple[ScoredTrial, np.ndarray]], weights: np.ndarray | None = None) -> Estimate:
         if not chosen:
             return UNDEFINED
         hit = np.array([[float(f.any())] for _, f in chosen])
-        return resample([t.unit for t, _ in chosen], level=level).rates(hit)[0]
+        return resample([t.unit for t, _ in chosen], level=level).rates(hit, weights=weights)[0]
 
     delays = np.array([float(np.flatnonzero(f)[0]) if f.any() else np.nan for _, f in deviated])
     hz = np.array([t.control_hz for t, _ in deviated])
     return Alarms(
         threshold=threshold,
-        clean=len(clean),
-        clean_alarmed=share(clean),
+        clean=len({t.unit for t, _ in clean}),
+        clean_alarmed=share(clean, _weights([t for t, _ in clean])),
         alarms_per_minute=_per_minute(clean, level),
         detected=share(deviated),
         helped=share([(t, f) for t, f in deviated if not t.success]),
@@ -215,16 +216,34 @@ def alarms(
 
 def _per_minute(clean: list[tuple[ScoredTrial, np.ndarray]], level: float) -> Estimate:
     """Alarms that begin, over minutes, with the cluster bootstrap's percentiles: no bound from above is known
-    for a rate per time."""
+    for a rate per time. Every first state weighs the same."""
     if not clean:
         return UNDEFINED
     begun = [float(np.sum(f & ~np.concatenate([[False], f[:-1]]))) for _, f in clean]
     minutes = [len(f) / t.control_hz / _MINUTE_S for t, f in clean]
-    columns = np.stack([begun, minutes], axis=1)
+    columns = np.stack([begun, minutes], axis=1) * _weights([t for t, _ in clean])
     sampling = resample([t.unit for t, _ in clean], level=level)
     means = sampling.means(columns)
     low, high = sampling.interval(means[:, :1] / means[:, 1:])
     return Estimate(float(columns[:, 0].sum() / columns[:, 1].sum()), float(low[0]), float(high[0]))
+
+
+def _weights(trials: Sequence[ScoredTrial]) -> np.ndarray:
+    """(T, 1) weights that sum to one in every unit."""
+    _, index, count = np.unique([t.unit for t in trials], return_inverse=True, return_counts=True)
+    return (1.0 / count[index])[:, None]
+
+
+def one_of_each_unit(trials: Sequence[ScoredTrial]) -> np.ndarray:
+    """(T,) bool: the first clean rollout of every unit.
+
+    A conformal threshold takes rollouts that are exchangeable; those of one first state are alike, or the
+    same one.
+    """
+    clean = np.flatnonzero([t.clean for t in trials])
+    found = np.zeros(len(trials), bool)
+    found[clean[np.unique([trials[i].unit for i in clean], return_index=True)[1]]] = True
+    return found
 
 
 def detection_report(
@@ -243,7 +262,7 @@ def detection_report(
     """
     half = halves(np.array([t.unit for t in trials]), seed)
     highest = np.array([t.highest for t in trials])
-    clean = np.array([t.clean for t in trials])
+    clean = one_of_each_unit(trials)
     limits = tuple(conformal_threshold(highest[clean & (half != h)], alpha) for h in (0, 1))
     fired = [t.after > limits[h] for t, h in zip(trials, half, strict=True)]
     labels = (DEVIATED, NEEDS_HELP)

@@ -99,9 +99,10 @@ def alarm_table(measured: Sequence[MeasuredDetector], alpha: float) -> Table:
     notes = (
         f"Conformal thresholds: at most {100 * alpha:g} % of successful clean rollouts alarmed, each half of "
         "the scenarios at the threshold that the other half gives. "
-        f"{first.clean} successful clean rollouts, {len(first.delays)} trials from recovery points. A "
-        "detector is asked from the handoff on. Delay: from the recovery point to the first alarm, among "
-        "trials with one. Alarms a minute count alarms that begin, with the cluster bootstrap's percentiles.",
+        f"{first.clean} first states with a successful clean rollout, {len(first.delays)} trials from "
+        "recovery points. A detector is asked from the handoff on. Delay: from the recovery point to the "
+        "first alarm, among trials with one. Alarms a minute count alarms that begin, with the cluster "
+        "bootstrap's percentiles.",
     )
     return Table("alarms", "Alarms", columns, tuple(rows), notes)
 

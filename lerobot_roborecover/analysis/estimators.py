@@ -14,9 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.units import ResamplingUnit, default_unit, unit_labels
+from lerobot_roborecover.analysis.units import (
+    ResamplingUnit,
+    default_unit,
+    initial_unit,
+    unit_labels,
+)
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.scenario import Outcome, Start
 
 DRAWS = 10_000
 
@@ -41,6 +46,8 @@ class ScenarioRates:
     sources: tuple[str, ...]
     units: tuple[str, ...]
     """What is independent of the others: see `units.py`."""
+    first_states: tuple[str, ...]
+    """Label of the first state that each branches off from."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -57,6 +64,7 @@ class ScenarioRates:
             take(self.cells),
             take(self.sources),
             take(self.units),
+            take(self.first_states),
         )
 
 
@@ -69,7 +77,8 @@ def scenario_rates(
         rows: trials of one policy, one start and one protocol.
         scheduled: trials every scenario was to have; those without a row count as failures. None takes the
             rows for all there is.
-        unit: what is independent; by default what the paper resamples on the rows' platform.
+        unit: what is independent; by default what the paper resamples on the rows' platform, and first
+            states where the rows are initial-state trials.
 
     Raises:
         RowsError: a trial occurs twice, a scenario's labels disagree, or more trials than scheduled.
@@ -101,7 +110,23 @@ def scenario_rates(
         cells=tuple(_label(g, lambda r: f"{r['stage']}-{r['deviation']}") for g in groups),
         sources=tuple(_label(g, lambda r: r["source"]) for g in groups),
         units=_units(ids, groups, unit),
+        first_states=_first_states(ids, groups),
     )
+
+
+def initial_rate_units(found: ScenarioRates) -> tuple[np.ndarray, list[str]]:
+    """Returns the rates of first states, over all trials of their scenarios, and their units.
+
+    Scenarios that share a first state have the same initial-state trial; it counts once.
+
+    Args:
+        found: initial-state trials.
+    """
+    labels, column = np.unique(found.first_states, return_inverse=True)
+    successes = np.bincount(column, found.rates * found.trials, len(labels))
+    trials = np.bincount(column, found.trials, len(labels))
+    units = dict(zip(found.first_states, found.units, strict=True))
+    return successes / np.maximum(trials, 1), [units[label] for label in labels.tolist()]
 
 
 def _units(
@@ -112,13 +137,26 @@ def _units(
         raise RowsError(
             f"the rows are of {len(platforms)} platforms ({', '.join(platforms)}); take one at a time"
         )
+    initial = any(r.get("start") == Start.INITIAL for g in groups for r in g)
     labels = unit_labels(
-        unit or default_unit(platforms[0] if platforms else ""),
+        initial_unit(unit) if initial else unit or default_unit(platforms[0] if platforms else ""),
         ids,
         [_label(g, lambda r: r.get("cluster") or "") for g in groups],
         [_label(g, lambda r: f"{r.get('suite', '')}/{r.get('task', '')}") for g in groups],
+        [_first_state(g) for g in groups],
     )
     return tuple(labels.tolist())
+
+
+def _first_states(ids: Sequence[str], groups: list[list[Mapping[str, Any]]]) -> tuple[str, ...]:
+    clusters = [_label(g, lambda r: r.get("cluster") or "") for g in groups]
+    states = [_first_state(g) for g in groups]
+    return tuple(unit_labels(ResamplingUnit.FIRST_STATE, ids, clusters, [], states).tolist())
+
+
+def _first_state(group: list[Mapping[str, Any]]) -> str:
+    """Of a scenario's rows; those of a log before schema 3 say none."""
+    return max((row.get("first_state") or "" for row in group), default="")
 
 
 def _label(group: list[Mapping[str, Any]], read: Callable[[Mapping[str, Any]], str]) -> str:

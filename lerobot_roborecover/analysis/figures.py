@@ -12,7 +12,6 @@ from lerobot_roborecover.analysis.figures_trials import interventions, mosaic, o
 from lerobot_roborecover.analysis.groups import group_rates, source_matrix
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.report_tables import initial_estimates
-from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.runs_tables import runs_figure
 from lerobot_roborecover.analysis.style import (
@@ -111,8 +110,8 @@ def _words(estimate: Estimate) -> str:
 def rank_transition(results: Results) -> Figure:
     """Ranks from initial states against ranks at recovery."""
     index = results.matched
-    initial_rates, recovery_rates, names, _ = results.both_starts
-    initial, recovery = masked_mean(initial_rates.T), masked_mean(recovery_rates.T)
+    first, second = results.both_starts
+    names, initial, recovery = first.policies, first.means, second.means
     left, right = _ranks(initial), _ranks(recovery)
 
     def draw(width: Width) -> Plot:

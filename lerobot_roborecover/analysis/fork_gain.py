@@ -19,9 +19,15 @@ from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.tables import Column, Table
-from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit, default_unit, unit_labels
+from lerobot_roborecover.analysis.units import (
+    ESTIMAND,
+    ResamplingUnit,
+    default_unit,
+    initial_unit,
+    unit_labels,
+)
 from lerobot_roborecover.env.trial_row import TrialRow
-from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.scenario import Outcome, ScenarioError, Start
 
 FORK = "fork"
 """Entry of a row's `options` that says which fork it is."""
@@ -131,7 +137,11 @@ class ForkGains:
             own[pair.row.scenario_id].append(pair)
         firsts = [pairs[0].row for pairs in own.values()]
         labels = unit_labels(
-            self.unit, list(own), [r.cluster for r in firsts], [f"{r.suite}/{r.task}" for r in firsts]
+            self.unit,
+            list(own),
+            [r.cluster for r in firsts],
+            [f"{r.suite}/{r.task}" for r in firsts],
+            [r.first_state for r in firsts],
         )
         draws = resample(labels)
 
@@ -152,7 +162,8 @@ def fork_gains(rows: Iterable[TrialRow], unit: ResamplingUnit | None = None) -> 
 
     Args:
         rows: of a log of forks.
-        unit: what is independent; by default the platform's.
+        unit: what is independent; by default the platform's, and first states where initial-state trials
+            are forked.
 
     Raises:
         ScenarioError: no row is of a fork, or no fork has its continuation.
@@ -188,9 +199,10 @@ def fork_gains(rows: Iterable[TrialRow], unit: ResamplingUnit | None = None) -> 
             "`reason` says why"
         )
     arms = tuple(dict.fromkeys(p.note.arm for p in pairs))
-    return ForkGains(
-        tuple(pairs), arms, len(others) - len(pairs), (reproduced, checked), unit or default_unit(platform)
-    )
+    if unit is None:
+        initial = any(p.row.start == Start.INITIAL for p in pairs)
+        unit = initial_unit(None) if initial else default_unit(platform)
+    return ForkGains(tuple(pairs), arms, len(others) - len(pairs), (reproduced, checked), unit)
 
 
 _NUMBERS = (

@@ -129,11 +129,15 @@ def _classes(rates: np.ndarray, invalid: bool) -> tuple[str, ...]:
     return (kind, "invalid") if invalid else (kind,)
 
 
-def _initial_rows(panel: Panel | None) -> dict[tuple[str, str], Sequence[TrialRow]]:
+def _initial_rows(panel: Panel | None) -> Mapping[tuple[str, str], Sequence[TrialRow]]:
     """Rows from initial states by policy and scenario id."""
     if panel is None:
         return {}
-    return {(panel.arms[p], panel.scenarios[n].id): rows for (p, n), rows in panel.rows.items()}
+    found: dict[tuple[str, str], list[TrialRow]] = {}
+    for (p, _), rows in panel.rows.items():
+        for row in rows:
+            found.setdefault((panel.arms[p], row.scenario_id), []).append(row)
+    return found
 
 
 _VALID = frozenset(outcome.value for outcome in Outcome if outcome.valid)

@@ -19,16 +19,15 @@ def tell_settings_apart(rows: Sequence[TrialRow]) -> None:
     `act@1a2b [num_inference_steps=2]`. The rows must be the caller's own: their `policy` is changed in place.
     """
     kinds: dict[str, dict[str, list[TrialRow]]] = {}
-    keys: dict[tuple[int, bool], str] = {}
+    keys: dict[int, str] = {}
     for row in rows:
-        recorded = row.first_state != ""
         # Rows of a log share their settings.
-        key = keys.setdefault((id(row.policy_settings), recorded), _key(row.policy_settings, recorded))
+        key = keys.setdefault(id(row.policy_settings), _key(row.policy_settings))
         kinds.setdefault(row.policy, {}).setdefault(key, []).append(row)
     for policy, by_settings in kinds.items():
         if len(by_settings) < 2:
             continue
-        settings = {key: of[0].policy_settings for key, of in by_settings.items() if key}
+        settings = {key: of[0].policy_settings or {} for key, of in by_settings.items() if key}
         labels = {key: _label(own, settings.values()) for key, own in settings.items()}
         for key, of in by_settings.items():
             label = labels.get(key, _NOT_RECORDED)
@@ -44,8 +43,8 @@ def settings_differences(first: dict[str, Any], second: dict[str, Any]) -> str:
     return ", ".join(f"{name} {_short(first.get(name))} / {_short(second.get(name))}" for name in names)
 
 
-def _key(settings: dict[str, Any], recorded: bool) -> str:
-    return json.dumps(settings, sort_keys=True) if recorded or settings else ""
+def _key(settings: dict[str, Any] | None) -> str:
+    return "" if settings is None else json.dumps(settings, sort_keys=True)
 
 
 def _label(own: dict[str, Any], all_settings: Iterable[dict[str, Any]]) -> str:

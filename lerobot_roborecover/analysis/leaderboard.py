@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.arms import Arm, arm_of, stopped
 from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.labels import tell_settings_apart
 from lerobot_roborecover.analysis.logs import clock_of
@@ -34,7 +35,7 @@ from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.env.policy_settings import settings_of_method
-from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
 
@@ -161,24 +162,28 @@ def make_leaderboard(
     groups: dict[tuple, dict[tuple, dict[tuple, tuple[TrialRow, str]]]] = {}
     contradicted: dict[tuple, str] = {}
     logs: dict[tuple, dict[str, None]] = {}
-    found: list[tuple[Path, str, str, list[TrialRow]]] = []
+    read: list[ReadLog] = []
+    digests: list[tuple[str, str]] = []
+    """Name and hash of the file of every log in `read`."""
     for path in files:
         name = str(path.relative_to(folder))
         try:
-            rows = read_trial_log(path)
+            log = read_log(path)
             if (record := read_record(path)) is not None:
                 records.append(record)
             digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         except (TrialLogError, OSError) as err:
             refused.append((name, str(err)))
             continue
-        if not rows:
+        if not log.rows:
             refused.append((name, "it holds no complete row"))
-        found.append((path, name, digest, rows))
-    tell_settings_apart([row for path, _, _, rows in found if path not in run_of_file for row in rows])
-    for path, name, digest, rows in found:
-        method, run = run_of_file.get(path, ("", ""))
-        for row in rows:
+        read.append(log)
+        digests.append((name, digest))
+    read, _ = with_first_states(read)
+    tell_settings_apart([row for log in read if log.path not in run_of_file for row in log.rows])
+    for log, (name, digest) in zip(read, digests, strict=True):
+        method, run = run_of_file.get(log.path, ("", ""))
+        for row in log.rows:
             run_of[id(row)] = run
             key = _board_key(row), _entry_key(row, method)
             other, first = (
@@ -231,7 +236,8 @@ def _board_key(row: TrialRow) -> tuple:
 
 def _entry_key(row: TrialRow, method: str) -> tuple:
     who = (method, None) if method else (row.policy, row.run_seed)
-    settings = settings_of_method(row.policy_settings) if method else row.policy_settings
+    settings = row.policy_settings or {}
+    settings = settings_of_method(settings) if method else settings
     own = repr(sorted(row.options.items(), key=str)), repr(sorted(settings.items(), key=str))
     return *who, row.execution_horizon, *own
 
@@ -381,7 +387,7 @@ def _arm(entry: tuple, rows: Sequence[TrialRow], start: Start, run_of: dict[int,
 
 
 def _initial(arm: Arm, options: Options) -> Estimate:
-    panel = make_panel([arm])
+    panel = make_panel([arm]).by_first_state()
     draws = resample(panel.units(options.cluster), options.draws, options.seed, options.level)
     return draws.rates(panel.rates.T)[0]
 

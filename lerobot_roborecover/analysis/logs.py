@@ -20,6 +20,7 @@ from lerobot_roborecover.analysis.arms import (
     stopped,
 )
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
@@ -90,13 +91,12 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     run_of: dict[int, int] = {}
     """By the identity of a row; of rows that are of no run, or of the first, nothing is said."""
     twice = 0
-    found: list[ReadLog] = []
     files: dict[str, Path] = {}
     runs: dict[str, dict[int, str]] = {}
     records: list[SequentialRecord] = []
-    for name, run, path in _files(logs):
-        log = read_log(path, name or None)
-        found.append(log)
+    named = list(_files(logs))
+    found, unknown = with_first_states([read_log(path, name or None) for name, _, path in named])
+    for (name, run, path), log in zip(named, found, strict=True):
         for policy in log.policies:
             files.setdefault(name or policy, log.path)
         if run is not None:
@@ -129,6 +129,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
                     f"{other.outcome!r} after {other.steps} in {_place(other, found)}. "
                     "Give the runs names (NAME=LOG), or leave one out"
                 )
+    remarks += unknown
     if twice:
         remarks.append(f"{twice} row(s) occur in more than one log with the same result; each counts once")
     kept = [row for row in rows.values() if platform is None or row.platform == platform]
@@ -155,10 +156,10 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
 
 def _check_one_setting(log: ReadLog, name: str) -> None:
     """Refuses a log whose one NAME would hide that its policy had several settings."""
-    known = [row for row in log.rows if row.first_state]
+    known = [row for row in log.rows if row.policy_settings is not None]
     for row in known:
         if row.policy_settings != known[0].policy_settings:
-            differences = settings_differences(known[0].policy_settings, row.policy_settings)
+            differences = settings_differences(known[0].policy_settings or {}, row.policy_settings or {})
             raise RowsError(
                 f"{log.path} holds trials of {log.policies[0]} under several settings ({differences}): no "
                 f"one NAME fits. Name the log alone, without {name}=, and they are told apart"
@@ -309,7 +310,9 @@ def clock_of(row: TrialRow) -> str:
 
 def _unknown_weights(rows: Sequence[TrialRow]) -> list[str]:
     """A remark for each policy on a server that does not say which weights it has."""
-    unknown = [r.policy for r in _apart(rows, "policy_settings") if UNKNOWN_WEIGHTS in r.policy_settings]
+    unknown = [
+        r.policy for r in _apart(rows, "policy_settings") if UNKNOWN_WEIGHTS in (r.policy_settings or {})
+    ]
     return [
         f"{policy}: the server's weights are not known, so its trials may be of several checkpoints"
         for policy in dict.fromkeys(unknown)

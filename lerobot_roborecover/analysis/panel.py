@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +32,8 @@ class ScenarioLabels:
     source_policy: str
     cluster: str
     horizon: int
+    first_state: str = ""
+    """Hash of the task's first state; empty where the rows do not say it."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Panel:
     arms: tuple[str, ...]
     """Titles, P of them."""
     scenarios: tuple[ScenarioLabels, ...]
-    """N of them, sorted by id."""
+    """N of them, sorted by id; first states where the panel is `by_first_state`."""
     successes: np.ndarray
     """(P, N) int."""
     trials: np.ndarray
@@ -89,7 +91,27 @@ class Panel:
             [s.id for s in self.scenarios],
             [s.cluster for s in self.scenarios],
             [f"{s.suite}/{s.task}" for s in self.scenarios],
+            [s.first_state for s in self.scenarios],
         )
+
+    def by_first_state(self) -> Panel:
+        """Returns the panel with one column per first state, the trials of its scenarios together.
+
+        For initial-state trials: scenarios that share a first state have the same trial. A column keeps the
+        labels that its scenarios share; its `id` names the first state.
+        """
+        labels, column = np.unique(self.units(ResamplingUnit.FIRST_STATE), return_inverse=True)
+        member = np.eye(len(labels), dtype=int)[column]  # (N, first states)
+        rows: dict[tuple[int, int], tuple[TrialRow, ...]] = {}
+        for (p, n), own in sorted(self.rows.items()):
+            rows[p, int(column[n])] = rows.get((p, int(column[n])), ()) + own
+        first = [int(np.flatnonzero(column == k)[0]) for k in range(len(labels))]
+        scenarios = [
+            replace(self.scenarios[n], id=str(label), cell="", source="", source_policy="", cluster="")
+            for label, n in zip(labels, first, strict=True)
+        ]
+        counts = (counts @ member for counts in (self.successes, self.trials, self.invalid))
+        return Panel(self.arms, tuple(scenarios), *counts, rows)
 
     def take(self, arms: Sequence[int], scenarios: Sequence[int]) -> Panel:
         """Some of the arms on some of the scenarios, by index."""
@@ -200,4 +222,5 @@ def _labels(row: TrialRow) -> ScenarioLabels:
         source_policy=row.source_policy,
         cluster=row.cluster,
         horizon=row.horizon,
+        first_state=row.first_state,
     )

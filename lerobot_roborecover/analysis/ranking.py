@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
-from lerobot_roborecover.analysis.contrasts import contrasts
+from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.resampling import Resampling, masked_mean
 
@@ -50,28 +50,72 @@ def inverted_pairs(
     return found
 
 
-def rank_agreement(
-    initial: np.ndarray, recovery: np.ndarray, names: Sequence[str], resampling: Resampling
-) -> RankAgreement:
+@dataclass(frozen=True)
+class StartRates:
+    """Rates of P policies from one start, and what is independent in them."""
+
+    policies: tuple[str, ...]
+    rates: np.ndarray
+    """(P, N) in [0, 1]; columns are first states where the trials are initial-state ones, else scenarios."""
+    resampling: Resampling
+    """Of the N columns."""
+
+    @property
+    def means(self) -> np.ndarray:
+        """(P,) each column weighing the same."""
+        return masked_mean(self.rates.T)
+
+
+@dataclass(frozen=True)
+class PairFromBothStarts:
+    """Two policies from initial states and from recovery points."""
+
+    initial: Contrast
+    recovery: Contrast
+    error: float
+    """Holm-adjusted p below which a difference is shown: two families of verdicts must hold at once, and each
+    gets half of the error. That is valid however trials of the two starts depend on each other."""
+
+    @property
+    def inverted(self) -> bool:
+        """Whether the observed order is the other way round at recovery."""
+        return self.initial.difference.value * self.recovery.difference.value < 0
+
+    @property
+    def shown(self) -> int:
+        """1 where the same order is shown from both starts, -1 where the opposite order is, else 0."""
+        return _direction(self.initial, self.error) * _direction(self.recovery, self.error)
+
+
+def _direction(contrast: Contrast, error: float) -> int:
+    known = contrast.p_holm == contrast.p_holm
+    return int(np.sign(contrast.difference.value)) if known and contrast.p_holm < error else 0
+
+
+def pairs_from_both_starts(initial: StartRates, recovery: StartRates) -> list[PairFromBothStarts]:
+    """Returns every pair of the policies, tested from both starts.
+
+    Args:
+        initial: by first state.
+        recovery: of the same policies, by scenario.
+    """
+    error = (1 - recovery.resampling.level) / 2
+    families = (contrasts(s.rates, s.policies, s.resampling) for s in (initial, recovery))
+    return [PairFromBothStarts(a, b, error) for a, b in zip(*families, strict=True)]
+
+
+def rank_agreement(initial: StartRates, recovery: StartRates) -> RankAgreement:
     """Compares the order by initial-state rate with the order by RSR.
 
     Args:
-        initial: (P, N) rates; NaN where not run.
-        recovery: (P, N) rates of the same policies on the same scenarios.
-        names: P names.
-        resampling: of the N scenarios.
+        initial: by first state.
+        recovery: of the same policies, by scenario.
     """
-    first, second = masked_mean(initial.T), masked_mean(recovery.T)
+    names = initial.policies
+    first, second = initial.means, recovery.means
     pairs = inverted_pairs(first, second)
     total = len(names) * (len(names) - 1) // 2
-    # Two families of verdicts must all hold at once: each gets half of the error.
-    error = (1 - resampling.level) / 2
-    shown = [
-        0 if c.p_holm != c.p_holm or c.p_holm >= error else int(np.sign(c.difference.value))
-        for rates in (initial, recovery)
-        for c in contrasts(rates, names, resampling)
-    ]
-    products = np.array(shown[:total]) * np.array(shown[total:])
+    products = np.array([pair.shown for pair in pairs_from_both_starts(initial, recovery)], int)
     same, other = int((products > 0).sum()), int((products < 0).sum())
     low, high = (2 * same / total - 1, 1 - 2 * other / total) if total else (float("nan"), float("nan"))
     rho, tau = _coefficients(first, second)

@@ -7,6 +7,7 @@ from collections import Counter
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
+from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions, task_gains
 from lerobot_roborecover.analysis.groups import Group, group_rates, source_matrix
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.macro import (
@@ -48,6 +49,7 @@ def all_tables(results: Results) -> list[Table]:
         tables.append(profiles(results))
     if len(results.matched) > 1:
         tables.append(ranks(results))
+        tables += [table for table in [inversions(results)] if table.rows]
     tables += [grouped(results, *axis) for axis in _AXES]
     if any(row.scenarios for row in source_matrix(results.recovery, results.draws)):
         tables.append(sources_by_policy(results))
@@ -57,7 +59,7 @@ def all_tables(results: Results) -> list[Table]:
         budgets(results), trial_metrics(results.recovery, results.draws), variance(results)
     ]  # fmt: skip
     if results.costs:
-        tables.append(interventions(results))
+        tables += [interventions(results), *gain_tables(results)]
     if published.policies(results.study.platform):
         tables.append(beside_published(results))
     return tables
@@ -71,7 +73,7 @@ def overall(results: Results) -> Table:
     macro = {MACRO_9: macro_9_estimates(panel, draws)}
     if cells.counted and not cells.is_macro_9:
         macro = {cells.title: macro_estimates(panel, draws), **macro}
-    retention = draws.ratios(panel.rates.T, results.initial_rates.T)
+    retention = results.retention
     initial = initial_estimates(results)
     valid = masked_mean(panel.valid_rates.T)
     tasks = rsr if results.tasks is None else results.tasks.rates(panel.rates.T)
@@ -95,8 +97,7 @@ def overall(results: Results) -> Table:
     notes = (
         "RSR: mean of the scenarios' success rates, each scenario counting the same. Macro-k: mean "
         "of the rates of the k cells that are large enough, for policies with trials in all of them; "
-        f"{MACRO_9}: of the paper's nine cells, and of no fewer. Retention: recovery over initial-state "
-        "success on the same scenarios. "
+        f"{MACRO_9}: of the paper's nine cells, and of no fewer. {_of_first_states(results)}"
         "Invalid trials count "
         "as failures, except under “RSR % without invalid”, where they and scenarios without a valid trial "
         "are left out.",
@@ -117,6 +118,18 @@ def _scenarios(results: Results, p: int) -> str | int:
     (arm,) = (a for a in results.study.of(Start.RECOVERY) if a.title == results.recovery.arms[p])
     wanted = max((row.run_scenarios or 0 for row in arm.rows), default=0)
     return f"{count} of {wanted}" if arm.missing.scenarios and wanted > count else count
+
+
+def _of_first_states(results: Results) -> str:
+    panel = results.initial
+    if panel is None:
+        return ""
+    return (
+        f"Initial state: mean over the {len(panel.scenarios)} first states that the scenarios branch off "
+        "from, each counting the same; they are the units of its interval. Retention: recovery over "
+        "initial-state success on the same scenarios, each with its first state's rate; first states are the "
+        "units. "
+    )
 
 
 def _of_tasks(results: Results) -> str:
@@ -392,15 +405,16 @@ def interventions(results: Results) -> Table:
     rows = [
         (
             c.arm, c.baseline, c.scenarios, c.direct, c.with_intervention, c.gain, d.p, d.p_holm,
-            _VERDICTS[d.verdict], c.extra_steps, c.triggered,
+            _VERDICTS[d.verdict], t.difference, t.p_holm, c.extra_steps, c.triggered,
             *(c.per_trial.get(kind, 0.0) for kind in kinds), c.matched, c.rescued, c.harmed,
         )
-        for c, d in zip(results.costs, results.procedure_contrasts, strict=True)
+        for c, d, t in zip(results.costs, results.procedure_contrasts, task_gains(results), strict=True)
     ]  # fmt: skip
     columns = (
         Column("Intervention"), Column("Direct control"), Column("Scenarios", "count"),
         Column("Direct RSR %", "percent"), Column("RSR %", "percent"), Column("Gain", "points"),
         Column("p", "p"), Column("p (Holm)", "p"), Column("Verdict"),
+        Column("Gain, tasks like these", "points"), Column("p (Holm), tasks", "p"),
         Column("Extra steps per trial", "number"), Column("Triggered %", "percent"),
         *(Column(f"{kind} per trial", "ratio") for kind in kinds),
         Column("Matched trials", "count"), Column("Rescued", "count"), Column("Harmed", "count"),
@@ -411,8 +425,9 @@ def interventions(results: Results) -> Table:
         "Matched trials share scenario and trial index. Rescued: direct control fails, the "
         "intervention solves. "
         "Harmed: direct control solves, the intervention loses. p (Holm): for the interventions of this "
-        "table, each against its direct control. p: sign flips, which test whether differences are as likely "
-        "to have either sign, not whether their mean is zero.",
+        "table, each against its direct control. Tasks like these: the same over tasks, for "
+        f"{ESTIMAND[ResamplingUnit.TASK]}; Holm for the same family. p: sign flips, which test whether "
+        "differences are as likely to have either sign, not whether their mean is zero.",
     )
     return Table("interventions", "Interventions against direct control", columns, tuple(rows), notes)
 

@@ -34,7 +34,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Resampling:
-    """N scenarios in their units (scenarios, trajectory clusters, or tasks), at one level of confidence."""
+    """N scenarios in their units (`units.ResamplingUnit`), at one level of confidence."""
 
     index: np.ndarray
     """(N,) int: every scenario's unit."""

@@ -17,6 +17,7 @@ from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
 from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
 from lerobot_roborecover.analysis.logs import Study
 from lerobot_roborecover.analysis.panel import Panel, make_panel
+from lerobot_roborecover.analysis.ranking import StartRates
 from lerobot_roborecover.analysis.resampling import SEED, Resampling, masked_mean, resample
 from lerobot_roborecover.analysis.runs import (
     MethodContrast,
@@ -29,7 +30,7 @@ from lerobot_roborecover.analysis.runs import (
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.soundness import barred_arms
-from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit
+from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.scenario import Start
@@ -82,7 +83,7 @@ class Results:
     recovery: Panel
     """Direct control from recovery points."""
     initial: Panel | None
-    """The same policies from initial states, those of them that have such trials."""
+    """The same policies from initial states, where they have such trials; a column per first state."""
     interventions: Panel | None
     """Direct baselines and interventions together, as `costs` compares them."""
     intervention_pairs: tuple[tuple[int, int], ...]
@@ -260,12 +261,25 @@ class Results:
 
     @cached_property
     def initial_contrasts(self) -> tuple[Contrast, ...]:
-        """The same pairs from initial states, on the same scenarios; a family of their own."""
-        keep = np.zeros(self.recovery.rates.shape, bool)
-        keep[np.ix_(self.compared.policies, self.compared.scenarios)] = True
+        """The same pairs from initial states, on the first states of the same scenarios; a family of their
+        own."""
+        panel = self.initial
+        if panel is None:
+            unknown = np.full(self.recovery.rates.shape, np.nan)
+            return tuple(contrasts(unknown, self.recovery.arms, self.draws, unit=self.unit))
+        states = set(self._initial_columns[list(self.compared.scenarios)].tolist()) - {-1}
+        keep = np.zeros((len(self.recovery.arms), len(panel.scenarios)), bool)
+        keep[np.ix_(self.compared.policies, sorted(states))] = True
         keep[[p for p, arm in enumerate(self.recovery.arms) if arm in self.left_out]] = True
-        rates = np.where(keep, self.initial_rates, np.nan)
-        return tuple(contrasts(rates, self.recovery.arms, self.draws, unit=self.unit))
+        rates = np.where(keep, self._rates_of_first_states, np.nan)
+        return tuple(
+            contrasts(rates, self.recovery.arms, self.resample(panel), unit=WORDS[self.initial_unit])
+        )
+
+    @property
+    def initial_unit(self) -> ResamplingUnit:
+        """What is taken as independent of initial-state trials."""
+        return initial_unit(self.options.cluster)
 
     @cached_property
     def procedure_contrasts(self) -> tuple[Contrast, ...]:
@@ -320,19 +334,37 @@ class Results:
         )
 
     @cached_property
-    def initial_rates(self) -> np.ndarray:
-        """(P, N) initial-state rates of the recovery panel's policies and scenarios; NaN where not run."""
-        rates = np.full(self.recovery.rates.shape, np.nan)
+    def _rates_of_first_states(self) -> np.ndarray:
+        """(P, F) initial-state rates of the recovery panel's policies; NaN where not run."""
         if self.initial is None:
-            return rates
-        index = {s.id: n for n, s in enumerate(self.recovery.scenarios)}
-        for p, policy in enumerate(self.recovery.arms):
-            for q, title in enumerate(self.initial.arms):
-                if title == policy:
-                    for m, scenario in enumerate(self.initial.scenarios):
-                        if scenario.id in index:
-                            rates[p, index[scenario.id]] = self.initial.rates[q, m]
-        return rates
+            return np.full((len(self.recovery.arms), 0), np.nan)
+        of = dict(zip(self.initial.arms, self.initial.rates, strict=True))
+        unknown = np.full(len(self.initial.scenarios), np.nan)
+        return np.stack([of.get(policy, unknown) for policy in self.recovery.arms])
+
+    @cached_property
+    def _initial_columns(self) -> np.ndarray:
+        """(N,) int: place of each recovery scenario's first state in the initial panel; -1 where none is."""
+        states = [] if self.initial is None else [s.id for s in self.initial.scenarios]
+        place = {state: k for k, state in enumerate(states)}
+        labels = self.recovery.units(ResamplingUnit.FIRST_STATE).tolist()
+        return np.array([place.get(label, -1) for label in labels], int)
+
+    @cached_property
+    def initial_rates(self) -> np.ndarray:
+        """(P, N) initial-state rates of the recovery panel's policies on each scenario's first state; NaN
+        where not run."""
+        unknown = np.full((len(self.recovery.arms), 1), np.nan)
+        return np.hstack([self._rates_of_first_states, unknown])[:, self._initial_columns]
+
+    @cached_property
+    def retention(self) -> list[Estimate]:
+        """Recovery over initial-state success of every policy, over the scenarios that have both.
+
+        First states are the units: scenarios that share one have the same initial-state trial.
+        """
+        draws = self.resample(self.recovery, self.initial_unit)
+        return draws.ratios(self.recovery.rates.T, self.initial_rates.T)
 
     @cached_property
     def _matched(self) -> Compared:
@@ -351,13 +383,27 @@ class Results:
         return list(self._matched.policies) if self._matched.scenarios and self.judged else []
 
     @property
-    def both_starts(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], Resampling]:
-        """Initial-state and recovery rates of the matched policies on the scenarios that all have; names;
-        units."""
-        index = np.ix_(self.matched, self._matched.scenarios)
+    def both_starts(self) -> tuple[StartRates, StartRates]:
+        """Rates of the matched policies from initial states, by first state, and from recovery points, by
+        scenario, on the scenarios that all have."""
+        return self.both_starts_over(None)
+
+    def both_starts_over(self, unit: ResamplingUnit | None) -> tuple[StartRates, StartRates]:
+        """The same over another unit, for both starts; None takes each start's own."""
         names = tuple(self.recovery.arms[p] for p in self.matched)
-        draws = self.draws.part(np.array(self._matched.scenarios, int))
-        return self.initial_rates[index], self.recovery.rates[index], names, draws
+        scenarios = self._matched.scenarios
+        states = sorted(set(self._initial_columns[list(scenarios)].tolist()) - {-1})
+        before = self._rates_of_first_states[np.ix_(self.matched, states)]
+        units = [] if self.initial is None else self.initial.units(unit or self.options.cluster)[states]
+        o = self.options
+        return (
+            StartRates(names, before, resample(units, o.draws, o.seed, o.level)),
+            StartRates(
+                names,
+                self.recovery.rates[np.ix_(self.matched, scenarios)],
+                self.resample(self.recovery, unit).part(np.array(scenarios, int)),
+            ),
+        )
 
     @cached_property
     def costs(self) -> list[InterventionCost]:
@@ -422,7 +468,7 @@ def analyse(study: Study, options: Options | None = None) -> Results:
         study,
         options,
         panel,
-        make_panel(initial) if initial else None,
+        make_panel(initial).by_first_state() if initial else None,
         make_panel(chosen, options.scheduled) if pairs else None,
         tuple(pairs),
         tuple(remarks),

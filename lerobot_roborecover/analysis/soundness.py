@@ -34,13 +34,15 @@ _CHECKS = {
 def barred_arms(panel: Panel) -> dict[str, ComparisonVerdict]:
     """Titles of the arms that no verdict can rest on, and why."""
     found, valid = {}, valid_trials(panel)
-    successes: list[list[list[bool]]] = [[] for _ in panel.arms]
+    # By scenario, also where columns are first states: how many scenarios share one is no count of trials.
+    successes: list[dict[str, list[bool]]] = [{} for _ in panel.arms]
     for (p, _), rows in sorted(panel.rows.items(), key=lambda item: item[0]):
-        successes[p].append([r.success for r in rows])
+        for row in rows:
+            successes[p].setdefault(row.scenario_id, []).append(row.success)
     for p, title in enumerate(panel.arms):
         if successes[p] and not valid[p]:
             found[title] = ComparisonVerdict.NO_VALID_TRIAL
-        elif counts_depend_on_outcomes(successes[p]):
+        elif counts_depend_on_outcomes(list(successes[p].values())):
             found[title] = ComparisonVerdict.COUNTS_DEPEND
     return found
 

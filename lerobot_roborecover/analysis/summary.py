@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_roborecover.analysis.estimators import (
     RowsError,
     ScenarioRates,
+    initial_rate_units,
     invalid_counts,
     scenario_rates,
 )
@@ -52,6 +53,7 @@ class StartSummary:
     scenarios: int
     trials: int
     rsr: Estimate
+    """Of initial-state trials: first states weigh the same, and are the units of the interval."""
     macro: Estimate
     """Over the cells that are large enough; undefined where none is."""
     macro9: Estimate
@@ -65,6 +67,8 @@ class StartSummary:
     """RSR without the trials that a simulator or a machine ended; None where there are none."""
     cells: tuple[CellSummary, ...]
     """Occupied cells, in the order of the paper's stages and types."""
+    first_states: int
+    """Of the scenarios."""
 
 
 @dataclass(frozen=True)
@@ -105,23 +109,29 @@ def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None
         start=start,
         scenarios=len(scenarios),
         trials=int(scenarios.trials.sum()),
-        rsr=rate_estimate(scenarios.rates, scenarios.units),
+        rsr=_rate_of(start, scenarios),
         macro=macro,
         macro9=macro9,
         macro_cells=macro_cells(scenarios.cells, scenarios.units),
         unit=WORDS[default_unit(str(rows[0].get("platform", "")))],
         invalid=invalid_counts(rows),
-        without_infrastructure=_without_infrastructure(rows),
+        without_infrastructure=_without_infrastructure(start, rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
+        first_states=len(set(scenarios.first_states)),
     )
 
 
-def _without_infrastructure(rows: Sequence[Mapping[str, Any]]) -> Estimate | None:
+def _rate_of(start: Start, scenarios: ScenarioRates) -> Estimate:
+    if start is Start.INITIAL:
+        return rate_estimate(*initial_rate_units(scenarios))
+    return rate_estimate(scenarios.rates, scenarios.units)
+
+
+def _without_infrastructure(start: Start, rows: Sequence[Mapping[str, Any]]) -> Estimate | None:
     left = [r for r in rows if not Outcome(r["outcome"]).infrastructure]
     if len(left) == len(rows) or not left:
         return None
-    scenarios = scenario_rates(left)
-    return rate_estimate(scenarios.rates, scenarios.units)
+    return _rate_of(start, scenario_rates(left))
 
 
 def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
@@ -172,6 +182,12 @@ def format_table(summary: Summary) -> str:
         if any(cell.underpowered for cell in recovery.cells):
             lines.append(f"* fewer than {UNDERPOWERED_BELOW} scenarios: neither rate nor interval says much")
         lines += recovery.macro_cells.notes(recovery.unit)
+    initial = summary.starts.get(Start.INITIAL)
+    if initial is not None and initial.first_states < initial.scenarios:
+        lines.append(
+            f"\nThe {initial.scenarios} scenarios branch off from {initial.first_states} first states: these "
+            "are what the initial-state rate is over"
+        )
     for start, part in summary.starts.items():
         if part.invalid:
             reasons = ", ".join(f"{count} {name}" for name, count in part.invalid.items())

@@ -90,7 +90,10 @@ def run(args: argparse.Namespace) -> int:
     differences = [d / 100 for d in given] if given else [d for d in (0.05, 0.1, 0.15, 0.2) if d < room]
     common = wanted, args.level, args.family
     tables = []
-    at = None if args.scenarios is None else _scenarios(args)
+    at = None
+    if args.scenarios is not None:
+        at, shared = _scenarios(args)
+        remarks += shared
     if at is not None:
         tables.append(detectable_table(guess, at, trials, *common))
     if at is None or given:
@@ -160,8 +163,8 @@ def _guess(args: argparse.Namespace):
     return guess, remarks
 
 
-def _scenarios(args: argparse.Namespace) -> int:
-    """How many there are: a number, or those of a set."""
+def _scenarios(args: argparse.Namespace) -> tuple[int, list[str]]:
+    """How many there are: a number, or those of a set; and what to know about them."""
     from lerobot_roborecover.analysis.estimators import RowsError
 
     text = args.scenarios
@@ -170,7 +173,14 @@ def _scenarios(args: argparse.Namespace) -> int:
             raise RowsError(
                 f"--scenarios={text} is not from 6 to a million: below six that differ no test can tell"
             )
-        return int(text)
+        return int(text), []
     from lerobot_roborecover.datasets import load_scenarios
 
-    return len(load_scenarios(text, revision=args.revision, split=args.split))
+    found = load_scenarios(text, revision=args.revision, split=args.split)
+    states = len({scenario.first_state_sha256() for scenario in found})
+    if states == len(found):
+        return len(found), []
+    return len(found), [
+        f"the {len(found)} scenarios branch off from {states} first states: a comparison from initial states "
+        f"has {states} units (--scenarios {states})"
+    ]

@@ -57,9 +57,10 @@ def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
     add(
         "--cluster",
-        choices=("scenario", "trajectory", "task"),
+        choices=("scenario", "trajectory", "first_state", "task"),
         help="what intervals and tests take as independent; task: the numbers speak of other tasks like "
-        "these (default: as the paper, trajectory on RoboTwin, else scenario)",
+        "these (default: as the paper, trajectory on RoboTwin, else scenario; initial-state trials: first "
+        "states)",
     )
 
 

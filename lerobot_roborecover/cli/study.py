@@ -80,10 +80,10 @@ def run(args: argparse.Namespace) -> int:
             print(line)
         return 0
     if args.stored:
-        from lerobot_roborecover.study.stored import summary_table, write_stored_logs
+        from lerobot_roborecover.study.stored import summary_tables, write_stored_logs
 
         done = write_stored_logs(study, args.out / "stored")
-        print(summary_table(done))
+        print(summary_tables(study, done))
         if not args.no_report:
             print(f"report {write_report(study, done, args.out / 'stored').files.html}")
         return 0

@@ -153,7 +153,7 @@ def read_trials(folder: Path) -> list[PolicyTrial]:
         except (OSError, ValueError, TypeError, KeyError) as err:
             raise ScenarioError(f"{current} cannot be read ({err!r}); remove it, or {folder}") from None
         rows = [row for row in rows if row.config_hash == hash_]
-    kinds = {digest_of([row.policy, row.policy_settings]) for row in rows if row.first_state}
+    kinds = {digest_of([row.policy, row.policy_settings]) for row in rows if row.policy_settings is not None}
     if len(kinds) > 1:
         raise ScenarioError(
             f"{folder} holds trials of {len(kinds)} policies, or of one under several settings, which would "

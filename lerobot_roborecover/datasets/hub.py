@@ -47,7 +47,7 @@ def pull(repo_id: str, revision: str | None) -> tuple[Path, str]:
         ScenarioError: the dataset cannot be reached or read, or holds no scenarios; with the remedy.
     """
     where = f"Hub dataset {repo_id}" + (f" at revision {revision!r}" if revision else "")
-    folder = _cached(repo_id, revision) if revision and _COMMIT.fullmatch(revision) else None
+    folder = cached_folder(repo_id, revision) if revision and _COMMIT.fullmatch(revision) else None
     try:
         folder = folder or _download(where, repo_id, revision)
     except GatedRepoError as err:
@@ -73,7 +73,7 @@ def pull(repo_id: str, revision: str | None) -> tuple[Path, str]:
                 f"{where}: access refused (HTTP {status}). Log in with `hf auth login`, or set HF_TOKEN to "
                 "a token that may read it"
             ) from err
-        folder = _cached(repo_id, revision)
+        folder = cached_folder(repo_id, revision)
         if folder is None:
             raise ScenarioError(
                 f"{where} could not be downloaded ({type(err).__name__}: {str(err)[:200]}), and the Hub "
@@ -107,7 +107,7 @@ def _download(where: str, repo_id: str, revision: str | None) -> Path:
     )
 
 
-def _cached(repo_id: str, revision: str | None) -> Path | None:
+def cached_folder(repo_id: str, revision: str | None) -> Path | None:
     """The snapshot in the Hub cache, if it holds both files."""
     try:
         folder = Path(

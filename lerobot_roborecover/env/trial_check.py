@@ -193,6 +193,11 @@ def _object(field: str, value: Any) -> None:
     _plain_json(field, value)
 
 
+def _optional_object(field: str, value: Any) -> None:
+    if value is not None:
+        _object(field, value)
+
+
 def _versions(field: str, value: Any) -> None:
     _object(field, value)
     for name, version in value.items():
@@ -290,7 +295,7 @@ _CHECKS: dict[str, Callable[[str, Any], None]] = {
     "finished_at": _moment,
     "progress": _progress,
     "first_state": _sha256_or_empty,
-    "policy_settings": _object,
+    "policy_settings": _optional_object,
     "run_scenarios": _optional_size,
     "run_trials": _optional_size,
     "shard": _shard,
@@ -373,7 +378,13 @@ class RowChecker:
         return value
 
 
-_SINCE_3 = {"first_state": "", "policy_settings": {}, "run_scenarios": None, "run_trials": None, "shard": ""}
+_SINCE_3 = {
+    "first_state": "",
+    "policy_settings": None,
+    "run_scenarios": None,
+    "run_trials": None,
+    "shard": "",
+}
 
 
 def _upgrade(record: dict[str, Any]) -> None:

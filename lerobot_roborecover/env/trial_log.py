@@ -307,7 +307,11 @@ class TrialLog:
         )
         if "fork" not in row.options:  # forks are trials of their own
             kind = _Kind(
-                _nameless(row.policy), row.start, row.config_hash, row.run_seed, row.first_state != ""
+                _nameless(row.policy),
+                row.start,
+                row.config_hash,
+                row.run_seed,
+                row.policy_settings is not None,
             )
             self._kinds[kind] += 1
 

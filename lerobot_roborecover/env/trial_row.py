@@ -134,9 +134,9 @@ class TrialRow:
     first_state: str = ""
     """Hash of the task's first state (`TrialStart.first_state_sha256`): initial-state trials of scenarios
     that share it are the same trial. Empty in logs before schema 3."""
-    policy_settings: dict = field(default_factory=dict)
+    policy_settings: dict | None = None
     """Everything about the policy beside its files that can change a result: options after the command line,
-    rename map, mapping file. Empty in logs before schema 3."""
+    rename map, mapping file. None, not recorded, in logs before schema 3."""
     run_scenarios: int | None = None
     """Scenarios that the run's selection has, over all its shards; None in logs before schema 3."""
     run_trials: int | None = None

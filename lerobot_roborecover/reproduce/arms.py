@@ -14,10 +14,11 @@ from typing import Any
 import yaml
 
 from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing, agreement
+from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.env.trial_log import read_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
@@ -222,7 +223,8 @@ def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callab
                 f"on with what is left ({log})"
             )
     ids = {s.id for s in scenarios}
-    rows = [r for r in read_trial_log(log) if r.scenario_id in ids and r.trial < plan.trials]
+    (read,), _ = with_first_states([read_log(log)])
+    rows = [r for r in read.rows if r.scenario_id in ids and r.trial < plan.trials]
     if len({row.config_hash for row in rows}) > 1:
         raise ScenarioError(
             f"{log} holds {start} trials under several settings, such as of two servers at one address; they "

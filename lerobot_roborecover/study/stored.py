@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.env.trial_row import Protocol, make_row
@@ -14,6 +15,10 @@ from lerobot_roborecover.study.arms import StudyArm, arms
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import read_outcomes
 from lerobot_roborecover.whole import write_whole
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.analysis.results import Results
+    from lerobot_roborecover.analysis.tables import Table
 
 
 def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
@@ -68,21 +73,34 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
     return found
 
 
-def summary_table(done: Sequence[StudyArm]) -> str:
-    """The policies' rates as Markdown: the table of README.md and docs/study.md.
+def summary_tables(study: StudyDefinition, done: Sequence[StudyArm]) -> str:
+    """Returns the tables of README.md and of the study's page as Markdown: policies, inverted pairs, and the
+    gains of interventions, over tasks and by who was driving.
 
     Args:
+        study: what.
         done: arms with logs.
     """
+    from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions
     from lerobot_roborecover.analysis.logs import read_study
-    from lerobot_roborecover.analysis.report_tables import overall
+    from lerobot_roborecover.analysis.report_tables import interventions
     from lerobot_roborecover.analysis.results import Options, analyse
-    from lerobot_roborecover.analysis.tables import Cell, Table, to_markdown
+    from lerobot_roborecover.analysis.tables import to_markdown
 
-    policies = [arm for arm in done if arm.start == "initial"]
-    names = {arm.name for arm in policies}
-    logs = [f"{arm.name}={arm.log}" for arm in done if arm.name in names]
-    results = analyse(read_study(logs), Options())
+    options = Options(baseline=study.base, interventions=study.interventions)
+    results = analyse(read_study([f"{arm.name}={arm.log}" for arm in done]), options)
+    tables = [_policies(results)]
+    if len(results.matched) > 1:
+        tables.append(inversions(results))
+    if results.costs:
+        tables += [interventions(results), *gain_tables(results)]
+    return "\n".join(to_markdown(table) for table in tables)
+
+
+def _policies(results: Results) -> Table:
+    from lerobot_roborecover.analysis.report_tables import overall
+    from lerobot_roborecover.analysis.tables import Cell, Table
+
     whole = overall(results)
     wanted = [
         i
@@ -92,10 +110,9 @@ def summary_table(done: Sequence[StudyArm]) -> str:
     ]
     places: dict[Cell, int] = {results.ranked.arms[p]: place for place, p in enumerate(results.best_first)}
     rows = sorted(whole.rows, key=lambda row: places.get(row[0], len(places)))
-    table = Table(
+    return Table(
         "overall",
         "The study's policies",
         tuple(whole.columns[i] for i in wanted),
         tuple(tuple(row[i] for i in wanted) for row in rows),
     )
-    return to_markdown(table)

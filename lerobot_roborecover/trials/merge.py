@@ -24,7 +24,7 @@ def protocol_of(row: TrialRow) -> dict[str, object]:
         "execution horizon": row.execution_horizon,
         "dataset revision": row.dataset_revision,
         **{f"option {name}": value for name, value in sorted(row.options.items())},
-        **{f"policy setting {name}": value for name, value in sorted(row.policy_settings.items())},
+        **{f"policy setting {name}": value for name, value in sorted((row.policy_settings or {}).items())},
         **{f"version of {name}": value for name, value in sorted(row.versions.items())},
     }
 

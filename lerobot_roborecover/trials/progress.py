@@ -13,7 +13,8 @@ import numpy as np
 
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.summary import rate_estimate
-from lerobot_roborecover.analysis.units import default_unit, unit_labels
+from lerobot_roborecover.analysis.units import default_unit, initial_unit, unit_labels
+from lerobot_roborecover.scenario import Start
 
 _LINE_EVERY_S = 15.0
 
@@ -69,7 +70,9 @@ class Tally:
             won, of = self._counts.get(key[0], (0, 0))
             self._counts[key[0]] = (won + row["success"], of + 1)
             cluster, platform = row.get("cluster") or "", str(row.get("platform", ""))
-            (self._units[key[0]],) = unit_labels(default_unit(platform), [key[0]], [cluster], [""])
+            unit = initial_unit(None) if self._start == Start.INITIAL else default_unit(platform)
+            states = [row.get("first_state") or ""]
+            (self._units[key[0]],) = unit_labels(unit, [key[0]], [cluster], [""], states)
 
     def wanted(self, row: dict[str, Any]) -> bool:
         """Whether a row is one of the trials asked for."""
@@ -102,8 +105,14 @@ class Tally:
         return ""
 
     def _estimate(self) -> Estimate:
-        rates = np.array([won / of for won, of in self._counts.values()])
-        return rate_estimate(rates, [self._units[scenario] for scenario in self._counts])
+        counts = self._counts
+        if self._start == Start.INITIAL:  # trials of one first state are one state's, whatever the scenario
+            counts = {}
+            for scenario, (won, of) in self._counts.items():
+                before = counts.get(self._units[scenario], (0, 0))
+                counts[self._units[scenario]] = (before[0] + won, before[1] + of)
+        rates = np.array([won / of for won, of in counts.values()])
+        return rate_estimate(rates, [self._units.get(name, name) for name in counts])
 
 
 class ProgressState(Protocol):

@@ -20,12 +20,12 @@ from typing import Any
 from lerobot_roborecover.analysis.intervals import LEVEL
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record, write_record
-from lerobot_roborecover.analysis.units import default_unit, unit_labels
+from lerobot_roborecover.analysis.units import default_unit, initial_unit, unit_labels
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.trial_log import read_log
 from lerobot_roborecover.env.trial_row import Protocol, TrialRow
-from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.scenario import Scenario, Start
 from lerobot_roborecover.trials.progress import Tally
 
 ALONE = "alone"
@@ -131,11 +131,13 @@ class Watch(Tally):
         level: float = LEVEL,
     ):
         super().__init__(protocol.start, [s.id for s in scenarios], trials)
+        initial = protocol.start == Start.INITIAL
         labels = unit_labels(
-            default_unit(scenarios[0].platform),
+            initial_unit(None) if initial else default_unit(scenarios[0].platform),
             [s.id for s in scenarios],
             [s.cluster for s in scenarios],
             [""] * len(scenarios),
+            [s.first_state_sha256() for s in scenarios],
         )
         self._unit_of = dict(zip([s.id for s in scenarios], labels.tolist(), strict=True))
         self._members: dict[str, list[Scenario]] = {}

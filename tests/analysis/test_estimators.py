@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.groups import group_rates, own_arm, source_mat
 from lerobot_roborecover.analysis.macro import macro_estimates, percentile_macro
 from lerobot_roborecover.analysis.monitor import METRICS, metric_columns
 from lerobot_roborecover.analysis.panel import make_panel
-from lerobot_roborecover.analysis.ranking import rank_agreement
+from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
 from lerobot_roborecover.analysis.resampling import masked_mean, resample
 from lerobot_roborecover.analysis.timing import budget_estimates, median_steps, rates_within
 from lerobot_roborecover.analysis.variance import variance_split
@@ -193,12 +193,19 @@ def test_profile_difference_by_hand():
     assert found.floor.value < found.hindsight
 
 
+def agreement(initial, recovery, names, units):
+    """Of policies whose scenarios have a first state each."""
+    return rank_agreement(
+        *(StartRates(tuple(names), rates, resample(units)) for rates in (initial, recovery))
+    )
+
+
 def test_rank_bounds_follow_from_what_is_separated_from_both_starts():
     """a above b from both starts, c and d the other way round, and nothing sure of the rest."""
     rng = np.random.default_rng(0)
     names, rates = "abcd", {"initial": (0.95, 0.05, 0.9, 0.1), "recovery": (0.95, 0.05, 0.1, 0.9)}
     initial, recovery = (rng.binomial(5, np.array(r)[:, None], (4, 60)) / 5 for r in rates.values())
-    found = rank_agreement(initial, recovery, names, resample([f"{i:02d}" for i in range(60)]))
+    found = agreement(initial, recovery, names, [f"{i:02d}" for i in range(60)])
     assert found.shown_same >= 1
     assert found.shown_inverted >= 1
     assert (found.inversions.low, found.inversions.high) == (found.shown_inverted, 6 - found.shown_same)
@@ -209,7 +216,7 @@ def test_rank_bounds_follow_from_what_is_separated_from_both_starts():
 def test_rank_inversions_by_hand():
     initial = np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], [0.7, 0.7]])
     recovery = np.array([[0.1, 0.1], [0.5, 0.5], [0.3, 0.3], [0.2, 0.2]])
-    found = rank_agreement(initial, recovery, "abcd", resample(list("xy")))
+    found = agreement(initial, recovery, "abcd", list("xy"))
     assert found.inversions.value == 3
     assert (found.inversions.low, found.inversions.high) == (0, 6)  # two scenarios show nothing
     assert found.inverted == (("a", "b"), ("a", "c"), ("a", "d"))  # c and d tie initially
@@ -217,7 +224,7 @@ def test_rank_inversions_by_hand():
 
 
 def test_one_policy_has_no_rank_agreement():
-    found = rank_agreement(np.ones((1, 3)), np.ones((1, 3)), "a", resample(list("xyz")))
+    found = agreement(np.ones((1, 3)), np.ones((1, 3)), "a", list("xyz"))
     assert found.inversions.value == 0
     assert math.isnan(found.rho)
     assert math.isnan(found.tau.low)

@@ -9,6 +9,7 @@ from lerobot_roborecover.analysis.fork_gain import ForkNote, fork_gains, gain_ta
 from lerobot_roborecover.analysis.fork_page import write_gains
 from lerobot_roborecover.analysis.intervals import difference_interval, spread
 from lerobot_roborecover.analysis.logs import RowsError, read_study
+from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.trial_rows import trial_row, write_log
 
@@ -47,6 +48,19 @@ def test_gains_by_hand():
     assert gains.of("fresh", step=25)[4].value == 0.0
     assert gains.of("fresh", cell="Approach / Wrong Target")[4].value == -1.0
     assert gains.of("fresh", step=25, cell="Approach / Wrong Target")[0] == 0
+
+
+def test_forks_of_one_first_state_are_one_unit():
+    """Scenarios that share a first state have the same initial-state trial, and its forks are the same."""
+    rows = [
+        fork(s, arm, arm == "fresh", start="initial", first_state=f"{s % 3:064x}")
+        for s in range(12)
+        for arm in ("continue", "fresh")
+    ]
+    assert fork_gains(rows).unit is ResamplingUnit.FIRST_STATE
+    assert fork_gains(rows_by_hand()).unit is ResamplingUnit.SCENARIO
+    gain = fork_gains(rows).of("fresh")[4]
+    assert (gain.low, gain.high) == difference_interval(spread(np.ones(12), [s % 3 for s in range(12)]))
 
 
 def test_repeats_and_steps_are_paired_each_with_its_own():

@@ -64,7 +64,7 @@ def test_long_settings_make_short_labels_that_differ(tmp_path):
 
 
 def test_rows_that_do_not_say_are_told_apart_from_those_that_do(tmp_path):
-    old = policy_rows("lab/act@1a2b", 12, 2, 0.5, 1, config_hash="old")
+    old = policy_rows("lab/act@1a2b", 12, 2, 0.5, 1, config_hash="old", policy_settings=None)
     rows = old + rows_of("lab/act@1a2b", policy_settings={"device": "cpu"})
     study = read_study([str(write_log(tmp_path / "log.jsonl", rows))])
     assert "lab/act@1a2b [settings not recorded]" in study.policies

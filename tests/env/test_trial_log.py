@@ -149,7 +149,7 @@ def test_logs_of_before_first_states_are_read(tmp_path):
     assert asdict(first) == new
     assert (second.first_state, second.policy_settings, second.run_scenarios, second.shard) == (
         "",
-        {},
+        None,
         None,
         "",
     )

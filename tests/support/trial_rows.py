@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,7 @@ def trial_row(scenario: int | str, trial: int = 0, success: bool = True, **chang
         "interventions": [], "options": {"obs_type": "pixels"}, "policy": policy, "execution_horizon": 10,
         "versions": {"lerobot": "0.6.1", "mujoco": "3.3.2"}, "config_hash": f"{policy}/{start}",
         "finished_at": "2026-01-02T03:04:05.000+00:00", "progress": None,
+        "first_state": sha256(name.encode()).hexdigest(), "policy_settings": {},
     }  # fmt: skip
     return TrialRow(**(values | changes))
 

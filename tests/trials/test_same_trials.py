@@ -147,7 +147,7 @@ def test_rows_of_an_earlier_version(run, tmp_path):
     assert f"{COUNT} row(s) of this policy in" in printed
     assert "written by an earlier version" in printed
     assert "--env.trial_log" in printed
-    alone = write_log(tmp_path / "old.jsonl", [r for r in rows if not r.first_state])
+    alone = write_log(tmp_path / "old.jsonl", [r for r in rows if r.policy_settings is None])
     assert main(["report", str(alone), "--out", str(tmp_path / "report")]) == 0
     assert main(["merge", str(alone), "--out", str(tmp_path / "m.jsonl")]) == 0
 

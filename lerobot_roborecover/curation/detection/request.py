@@ -219,14 +219,14 @@ def _host(request: DetectionRequest, platform: str) -> tuple[Any, dict[str, Any]
 
 
 def _remarks(trials: Sequence[SeenTrial], request: DetectionRequest) -> list[str]:
-    clean = sum(t.row.start == "initial" and t.row.success for t in trials)
+    clean = len({t.unit for t in trials if t.row.start == "initial" and t.row.success})
     least = least_rollouts(request.alpha)
     if clean // 2 >= least:
         return []
     return [
-        f"{clean} successful clean rollouts, about half of them for each threshold: at a false-alarm rate of "
-        f"{request.alpha:g} at least {least} are needed for a finite one. Detectors without one never alarm; "
-        "give more scenarios, or a higher --alpha"
+        f"successful clean rollouts from {clean} first states, about half of them for each threshold: at a "
+        f"false-alarm rate of {request.alpha:g} at least {least} are needed for a finite one. Detectors "
+        "without one never alarm; give more scenarios, or a higher --alpha"
     ]
 
 

@@ -82,8 +82,8 @@ class SeenTrial:
 
     @property
     def unit(self) -> str:
-        """What is independent."""
-        return self.scenario.cluster or self.scenario.id
+        """Label of what is independent: the first state, which scenarios share that branch off from it."""
+        return self.scenario.first_state_sha256()
 
     @property
     def segments(self) -> tuple[slice, ...]:

@@ -227,7 +227,7 @@ def _check_same(run: Run, row: TrialRow) -> None:
             f"the policy now {run.protocol.execution_horizon}: give --policy-option "
             f"n_action_steps={row.execution_horizon}"
         )
-    if not row.first_state:
+    if row.policy_settings is None:
         raise ScenarioError(
             f"trial {row.trial} of {row.scenario_id} was written by an earlier version, which does not say "
             "the policy's options: what it did may not be continued. Run it again, with "

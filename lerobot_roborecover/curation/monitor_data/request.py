@@ -143,7 +143,7 @@ def _continuations(
 
 def _who(row: TrialRow) -> str:
     """A row's policy with its settings; the name alone where the row is of an earlier version."""
-    return row.policy if not row.first_state else f"{row.policy} {digest_of(row.policy_settings)}"
+    return row.policy if row.policy_settings is None else f"{row.policy} {digest_of(row.policy_settings)}"
 
 
 def _asked(policy: str, device: str | None) -> str:
