@@ -133,9 +133,11 @@ def _add_up(path: Path, data: Any, chunks: list[Chunk], expansion: int, *, plain
         "bytes decoded": most,
     }
     sums = dict.fromkeys(limits, 0)
+    copied: list[tuple[str, Chunk, Page, int]] = []
     for chunk in chunks:
         where = f"{path}: field {chunk.name}"
-        values, dictionary = 0, None
+        values, coded = 0, 0
+        dictionary: Page | None = None
         try:
             for page in chunk.pages(data):
                 if (page.encoding not in ENCODINGS and page.encoding >= 0) or (plain and not _is_plain(page)):
@@ -149,15 +151,22 @@ def _add_up(path: Path, data: Any, chunks: list[Chunk], expansion: int, *, plain
                 if page.dictionary:
                     dictionary = page
                 elif page.encoding in DICTIONARY and chunk.kind == BYTE_ARRAY:
-                    left = most - sums["bytes decoded"]
-                    sums["bytes decoded"] += _dictionary_bytes(where, data, chunk, dictionary, page, left)
-                    _check(where, sums, limits)
+                    coded += page.values
         except PagesError as err:
             raise ScenarioError(f"{path}: {err}") from None
         if values != chunk.values:
             raise ScenarioError(
                 f"{where}: its pages hold {values} values, the footer says {chunk.values}; fetch it again"
             )
+        if coded:
+            if dictionary is None:
+                raise ScenarioError(f"{where} has no dictionary; fetch the file again")
+            copied.append((where, chunk, dictionary, coded))
+    # Texts are copied from their dictionary. How long its entries are is only looked at where that matters.
+    if sums["bytes decoded"] + sum(coded * page.uncompressed for _, _, page, coded in copied) > most:
+        for where, chunk, dictionary, coded in copied:
+            sums["bytes decoded"] += coded * _longest(where, data, chunk, dictionary)
+            _check(where, sums, limits)
 
 
 _NOT_PLAIN = (
@@ -186,14 +195,8 @@ def _too_much(where: str, size: int, unit: str, limit: int) -> str:
     )
 
 
-def _dictionary_bytes(
-    where: str, data: Any, chunk: Chunk, dictionary: Page | None, page: Page, left: int
-) -> int:
-    """Returns a bound of the bytes that a page's values take once they are copied from the dictionary."""
-    if dictionary is None:
-        raise ScenarioError(f"{where} has no dictionary; fetch the file again")
-    if page.values * dictionary.uncompressed <= left:
-        return page.values * dictionary.uncompressed
+def _longest(where: str, data: Any, chunk: Chunk, dictionary: Page) -> int:
+    """Returns the length of a dictionary's longest entry."""
     packed = data[dictionary.at : dictionary.at + dictionary.compressed]
     try:
         codec = CODECS[chunk.codec]
@@ -208,7 +211,7 @@ def _dictionary_bytes(
         longest, at = max(longest, length), at + 4 + length
         if at > len(entries):
             raise ScenarioError(f"{where}: its dictionary ends early; fetch the file again")
-    return page.values * longest
+    return longest
 
 
 def _fixed_bytes(kind: pa.DataType, slots: int, values: int) -> int:

@@ -360,6 +360,9 @@ def test_honest_files_that_compress_well_are_read(tmp_path):
     pq.write_table(pa.table({"picture": pictures}), path, row_group_size=300)
     check_file(tmp_path, path.name)
     names = [f"scenario-{i:06d}-of-the-test-split" for i in range(100_000)]
+    texts = {f"text {i}": [f"{name} {i}" for name in names[:30_000]] for i in range(4)}
+    pq.write_table(pa.table(texts), path, compression="zstd", row_group_size=10_000)
+    check_file(tmp_path, path.name)
     pq.write_table(pa.table({"id": names}), path, compression="zstd")
     check_file(tmp_path, path.name)
 
