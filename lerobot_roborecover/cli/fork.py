@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -50,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--policy-option", action="append", default=[], metavar="NAME=VALUE",
         help="option of the policy as it was run, e.g. n_action_steps=10; may be given again",
     )  # fmt: skip
+    add(
+        "--rename_map", type=json.loads, default={},
+        help="the env's observation keys to the policy's, JSON, as it was run",
+    )  # fmt: skip
     add("--device", help="of the policies")
     add("--slots", type=int, default=0, help="simulators at once (as roborecover eval)")
     add(
@@ -73,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
         at = tuple(int(step) for step in args.at.split(",") if step.strip())
     except ValueError:
         raise OptionError(f"--at={args.at}: steps, e.g. 0,40,80") from None
+    if not isinstance(args.rename_map, dict):
+        raise OptionError(f"--rename_map={args.rename_map!r:.80}: a JSON object of observation keys")
     request = ForkRequest(
         args.logs,
         args.policy,
@@ -84,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
         args.revision,
         args.env,
         args.policy_option,
+        args.rename_map,
         correction_steps=args.correction_steps,
         device=args.device,
         slots=args.slots,

@@ -371,6 +371,8 @@ def test_the_command(policies, logs, tmp_path, capsys):
     assert "--env.record_actions=true" in capsys.readouterr().err
     assert "Name the checkpoint that ran them" in refused("--policy", str(policies["diffusion"]))
     assert "n_action_steps=2" in refused("--policy-option", "n_action_steps=3")
+    other = refused("--rename_map", '{"observation.image": "observation.images.top"}')
+    assert "other settings of the policy than here (there / here: rename_map null / " in other
     assert "option handoff_check True" in refused("--env", "handoff_check=false")
     assert "--at=x" in refused("--at", "x")
     assert "no trial is left" in refused("--of", "successes" if not any(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.env.run import Run
+from lerobot_roborecover.env.trial_check import TRIAL_SCHEMA
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.env.vector_env import ScenarioVectorEnv
 from lerobot_roborecover.platforms import platform_named
@@ -273,4 +274,6 @@ def test_log_lines_are_plain_json_with_everything_a_table_needs(dataset, tmp_pat
         "versions",
         "finished_at",
     } <= record.keys()
-    assert read_trial_log(log)[0].schema == 2
+    row = read_trial_log(log)[0]
+    assert row.schema == TRIAL_SCHEMA
+    assert (row.run_scenarios, row.run_trials, row.shard) == (6, 1, "0/1")

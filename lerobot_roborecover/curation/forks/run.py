@@ -238,8 +238,8 @@ def _check_same(run: Run, row: TrialRow) -> None:
         differences = settings_differences(row.policy_settings, dict(settings))
         raise ScenarioError(
             f"trial {row.trial} of {row.scenario_id} was run with other settings of the policy than here "
-            f"(there / here: {differences}), which gives another trial. Fork it with --policy-option and "
-            "--rename-map as it was run"
+            f"(there / here: {differences}), which gives another trial. Fork it with --policy-option, "
+            "--rename_map and --device as it was run"
         )
     here, there = dict(run.protocol.options), {k: v for k, v in row.options.items() if k not in _FREE}
     for kind, ours, theirs in (("option", here, there), ("version of", run.protocol.versions, row.versions)):
