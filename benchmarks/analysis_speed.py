@@ -1,6 +1,7 @@
 """How long a report takes: 12 policies × 200 scenarios × 5 trials, both starts, all intervals and pairs.
 
     python benchmarks/analysis_speed.py [--policies 12] [--scenarios 200] [--trials 5]
+    python benchmarks/analysis_speed.py --policies 120 --scenarios 20 --trials 2    # many pairs
 
 Prints seconds, and seconds of processor time, from log files on disk: reading and checking, all tables
 (10,000 draws), all figures and files.
@@ -9,6 +10,7 @@ Prints seconds, and seconds of processor time, from log files on disk: reading a
 from __future__ import annotations
 
 import argparse
+import resource
 import sys
 import tempfile
 import time
@@ -46,6 +48,7 @@ def main() -> None:
         marks.append(_now())
     pairs = args.policies * (args.policies - 1) // 2
     print(f"{sum(len(arm.rows) for arm in study.arms)} trials, {len(tables)} tables, {pairs} pairs")
+    print(f"{len(results.shown_pairs)} of them drawn and dealt; {_memory_mb()} MB at most")
     for title, first, last in (
         ("read and check", 0, 1),
         ("all tables", 1, 2),
@@ -54,6 +57,10 @@ def main() -> None:
     ):
         wall, processor = (marks[last][k] - marks[first][k] for k in range(2))
         print(f"{title:<30}{wall:6.1f} s  {processor:6.1f} s of processor time")
+
+
+def _memory_mb() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 
 
 def _now() -> tuple[float, float]:
