@@ -3,11 +3,12 @@ policy go on and against stepping in always, where nothing was learned (docs/ste
 
     python -m recipes.stepping_in --platform libero --out outputs/stepping_in
     python -m recipes.stepping_in --platform metaworld --out outputs/stepping_in_metaworld
+    python -m recipes.stepping_in --platform metaworld --out outputs/stored --stored
 
 The training scenarios are divided, by what they share, into three parts. On one, Correction is trained
 (`roborecover donors`, `lerobot-train`); on the next, the base's trials are forked with that Correction, and
 detectors fitted; on the third, their thresholds are set. Then every arm is run on the test scenarios, and
-reported. What is finished is skipped.
+reported. What is finished is skipped. `--store` keeps the outcomes with the code, `--stored` reports those.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Scenario
 from recipes.commands import evaluate, roborecover
+from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.training import Training
 
 PARTS = {"donors": 0.45, "forks": 0.35, "thresholds": 0.2}
@@ -32,6 +34,7 @@ DETECTORS = {"gain": "recovery_gain", "features": "policy_features", "elapsed": 
 ALPHA = 0.1
 """Chance of a false alarm in a clean rollout that the thresholds allow."""
 BASELINE = "direct"
+ARMS = (BASELINE, "reversion", "correction", *DETECTORS)
 
 
 @dataclass(frozen=True)
@@ -165,29 +168,39 @@ class SteppingIn:
         )  # fmt: skip
         return out / "detectors"
 
-    def arm(self, name: str, *options: str) -> str:
-        """One arm on the test scenarios, as `roborecover report` takes it."""
-        log = evaluate(
+    def arm(self, name: str, *options: str) -> Path:
+        """Runs one arm on the test scenarios; returns its trial log."""
+        return evaluate(
             self.platform, self.subject.scenarios, "test", self.out / "test" / name,
             self._snapshots("--env."), "--policy.type=roborecover_intervention",
             f"--policy.base.path={self.subject.base}", *options,
         )  # fmt: skip
-        return f"{name}={log}"
 
-    def run(self) -> None:
-        """Everything, then the report."""
+    def run(self) -> dict[str, Path]:
+        """Runs everything; returns the arms' trial logs."""
         correction = self.correction()
         detectors = self.detectors(self.forks(correction))
         by_correction = f"--policy.correction.path={correction}"
-        logs = [
-            self.arm(BASELINE, "--policy.mode=direct"),
-            self.arm("reversion", "--policy.mode=reversion"),
-            self.arm("correction", "--policy.mode=correction", by_correction),
-        ]
+        logs = {
+            BASELINE: self.arm(BASELINE, "--policy.mode=direct"),
+            "reversion": self.arm("reversion", "--policy.mode=reversion"),
+            "correction": self.arm("correction", "--policy.mode=correction", by_correction),
+        }
         for name in DETECTORS:
             monitor = f"--policy.monitor.path={detectors / name}"
-            logs.append(self.arm(name, "--policy.mode=monitor_correction", by_correction, monitor))
-        roborecover("report", *logs, "--baseline", BASELINE, "--out", self.out / "report")
+            logs[name] = self.arm(name, "--policy.mode=monitor_correction", by_correction, monitor)
+        return logs
+
+
+def stored_folder(platform: str) -> Path:
+    """Returns the folder of a platform's stored outcomes."""
+    return OUTCOMES / f"stepping_in_{platform}"
+
+
+def report(logs: Mapping[str, Path], out: Path) -> None:
+    """Writes and prints the report on the arms' trial logs."""
+    named = [f"{name}={log}" for name, log in logs.items()]
+    roborecover("report", *named, "--baseline", BASELINE, "--out", out / "report")
 
 
 def main() -> None:
@@ -200,7 +213,13 @@ def main() -> None:
     add("--out", type=Path, required=True, help="folder to work in; a rerun goes on there")
     add("--scenarios", help="another set of the platform, with the splits train and test")
     add("--every", type=int, help="fork every so many steps")
+    add("--store", action="store_true", help="keep the outcomes with the code")
+    add("--stored", action="store_true", help="run nothing: report the outcomes kept with the code")
     args = parser.parse_args()
+    if args.stored:
+        stored = stored_logs(stored_folder(args.platform))
+        report({name: stored[name] for name in ARMS}, args.out)
+        return
     subject = SUBJECTS[args.platform]
     if not subject.base.is_dir():
         parser.error(
@@ -214,7 +233,11 @@ def main() -> None:
         f"training scenarios: {', '.join(f'{len(ids)} for {part}' for part, ids in parts.items())}",
         flush=True,
     )
-    SteppingIn(args.platform, subject, args.out, parts).run()
+    run = SteppingIn(args.platform, subject, args.out, parts)
+    logs = run.run()
+    if args.store:
+        store_logs(logs | {"forks": run.out / "forks" / "trials.jsonl"}, stored_folder(args.platform))
+    report(logs, args.out)
 
 
 if __name__ == "__main__":

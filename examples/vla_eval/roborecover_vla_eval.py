@@ -17,6 +17,7 @@ import logging
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any, ClassVar
 
 import draccus
@@ -30,6 +31,7 @@ from vla_eval.specs import DimSpec
 
 from lerobot_roborecover.env.configs import env_type
 from lerobot_roborecover.env.facts import RunFacts
+from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS, digest_of
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.errors import RoboRecoverError
@@ -89,7 +91,12 @@ class RecoveryBenchmark(StepBenchmark):
             )
         if trial_log:
             options.trial_log = trial_log.format(pid=os.getpid())
-        facts = RunFacts(policy=policy, policy_type="vla_eval", execution_horizon=1)
+        settings = {
+            "mapping": digest_of(asdict(self._mapping)),
+            "flags": [send_wrist_image, send_state, quat_no_antipodal],
+            UNKNOWN_WEIGHTS: "not known",
+        }
+        facts = RunFacts(policy, "vla_eval", execution_horizon=1, policy_settings=settings)
         scenarios, self._run = open_run(options, options.run_spec(), workers=workers, facts=facts)
         self._scenarios = {s.id: s for s in scenarios}
         self._env_pre, self._env_post = options.get_env_processors()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.extent import Missing, missing
+from lerobot_roborecover.analysis.labels import settings_differences
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
+from lerobot_roborecover.env.policy_settings import settings_of_method
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
 
@@ -29,6 +32,8 @@ class Arm:
     unreached: bool = False
     """Whether scenarios are missing because a sequential test was decided before their turn: they are no
     failures, and the policy is not ranked."""
+    missing: Missing = field(default_factory=Missing)
+    """What it lacks of what its runs were to evaluate, as far as the rows say."""
 
     @property
     def title(self) -> str:
@@ -105,24 +110,39 @@ def arm_of(policy: str, start: Start, runs: Mapping[str, Sequence[TrialRow]]) ->
         RowsError: the runs differ in more than weights and seed.
     """
     firsts = [rows[0] for rows in runs.values()]
+    lacking = [(run, missing(rows)) for run, rows in runs.items()]
     for first, run in zip(firsts, runs, strict=True):
-        for field in ("execution_horizon", "options"):
-            if getattr(first, field) != getattr(firsts[0], field):
+        for what in ("execution_horizon", "options"):
+            if getattr(first, what) != getattr(firsts[0], what):
                 raise RowsError(
-                    f"{policy}: its runs differ in {field}: {getattr(firsts[0], field)} in "
-                    f"{next(iter(runs))}, {getattr(first, field)} in {run}. Runs of one method differ in "
+                    f"{policy}: its runs differ in {what}: {getattr(firsts[0], what)} in "
+                    f"{next(iter(runs))}, {getattr(first, what)} in {run}. Runs of one method differ in "
                     "weights and seed alone; give them names of their own (NAME=LOG)"
                 )
+        ours, theirs = (settings_of_method(row.policy_settings) for row in (firsts[0], first))
+        if ours != theirs and first.first_state and firsts[0].first_state:
+            raise RowsError(
+                f"{policy}: its runs differ in the policy's settings: {settings_differences(ours, theirs)} "
+                f"({next(iter(runs))} / {run}). Runs of one method differ in weights and seed alone; give "
+                "them names of their own (NAME=LOG)"
+            )
     rewinds = tuple(sorted({row.rewind_steps for rows in runs.values() for row in rows}))
     if len(runs) == 1:
         (rows,) = runs.values()
-        return Arm(policy, start, rewinds, tuple(rows))
+        return Arm(policy, start, rewinds, tuple(rows), missing=lacking[0][1])
     stride = 1 + max(row.trial for rows in runs.values() for row in rows)
     numbered = tuple(
         (run, tuple(replace(row, trial=row.trial + k * stride) for row in rows))
         for k, (run, rows) in enumerate(runs.items())
     )
-    return Arm(policy, start, rewinds, tuple(row for _, rows in numbered for row in rows), numbered)
+    of_runs = Missing(
+        *("; ".join(f"{run}: {text}" for run, text in texts if text) for texts in (
+            [(run, found.scenarios) for run, found in lacking],
+            [(run, found.trials) for run, found in lacking],
+        ))
+    )  # fmt: skip
+    rows = tuple(row for _, rows in numbered for row in rows)
+    return Arm(policy, start, rewinds, rows, numbered, missing=of_runs)
 
 
 def stopped(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> tuple[Arm, ...]:
@@ -135,6 +155,7 @@ def stopped(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> tuple[A
             trials = Counter(row.scenario_id for row in arm.rows)
             short = any(trials[scenario] < record.trials for scenario in record.scenarios)
             arm = replace(arm, unreached=record.decided and short)
+            arm = replace(arm, missing=Missing()) if arm.unreached else arm
         found.append(arm)
     return tuple(found)
 
@@ -146,6 +167,9 @@ def _differences(first: TrialRow, second: TrialRow) -> str:
         for f in fields
         if getattr(first, f) != getattr(second, f)
     ]
+    if first.policy_settings != second.policy_settings:
+        differences = settings_differences(first.policy_settings, second.policy_settings)
+        found.append(f"the policy's settings ({differences})")
     return ", ".join(found) or "the evaluation's options (see the rows' config_hash)"
 
 
@@ -177,6 +201,11 @@ def arm_remarks(arms: Sequence[Arm]) -> list[str]:
         start: {row.scenario_id for arm in arms if arm.start is start for row in arm.rows} for start in Start
     }
     for arm in arms:
+        if arm.missing:
+            remarks.append(
+                f"{arm.title}: incomplete: {arm.missing.words}; what is missing may be no accident, so it "
+                "has no verdict. Run the rest, or ask for what all were run on with --common"
+            )
         if arm.runs:
             run_on = [{row.scenario_id for row in rows} for _, rows in arm.runs]
             lacking_runs = set.union(*run_on) - set.intersection(*run_on)

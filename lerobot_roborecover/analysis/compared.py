@@ -5,6 +5,7 @@ A policy that was run on a few scenarios only has no rate to rank beside those t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,9 @@ class Compared:
     """Which they are, in a sentence; empty where nothing was left out."""
 
 
-def compared(run: np.ndarray, names: tuple[str, ...], *, common: bool = False) -> Compared:
+def compared(
+    run: np.ndarray, names: tuple[str, ...], *, common: bool = False, lacking: Mapping[int, str] | None = None
+) -> Compared:
     """Chooses the policies and scenarios that are ranked.
 
     Of the tables that the policies with most scenarios fill together (the first one, the first two, ...), it
@@ -35,8 +38,13 @@ def compared(run: np.ndarray, names: tuple[str, ...], *, common: bool = False) -
         run: (P, N) bool: which policy was run on which scenario.
         names: P names.
         common: take all policies, on the scenarios common to all.
+        lacking: policies that did not finish what they were to be run on, and what they lack; none of them is
+            ranked beside one that did.
     """
     policies, scenarios = run.shape
+    lacking = lacking or {}
+    if 0 < len(lacking) < policies:
+        run = run & ~np.isin(np.arange(policies), list(lacking))[:, None]
     order = np.argsort(-run.sum(1), kind="stable")
     shared = np.logical_and.accumulate(run[order], axis=0).sum(1)
     size = shared * np.arange(1, policies + 1)
@@ -48,7 +56,9 @@ def compared(run: np.ndarray, names: tuple[str, ...], *, common: bool = False) -
         words.append(f"policies are ranked on the {len(keep)} of {scenarios} scenarios that all were run on")
     elif len(chosen) < policies:
         left = ", ".join(
-            f"{names[p]} ({int(run[p].sum())} of {scenarios})" for p in range(policies) if p not in chosen
+            f"{names[p]} ({lacking.get(p) or f'{int(run[p].sum())} of {scenarios}'})"
+            for p in range(policies)
+            if p not in chosen
         )
         on = f"all {scenarios}" if len(keep) == scenarios else f"the same {len(keep)} of {scenarios}"
         who = "policy" if len(chosen) == 1 else "policies"

@@ -142,4 +142,4 @@ def own_arm(source_policy: str, arms: Sequence[str]) -> int | None:
 
 
 def _plain(policy: str) -> str:
-    return policy.split("@")[0].rstrip("/").rsplit("/", 1)[-1].casefold()
+    return policy.split("@")[0].split(" [")[0].rstrip("/").rsplit("/", 1)[-1].casefold()

@@ -35,8 +35,14 @@ def headline(results: Results) -> str:
         sentences.append(_method(results, name))
     if not results.compared.complete:
         sentences.append(_who(results))
+    if results.lacking:
+        sentences.append(
+            "Incomplete: "
+            + ", ".join(f"{results.recovery.arms[p]} ({lack})" for p, lack in results.lacking.items())
+            + ("." if results.judged else ", so there is no verdict.")
+        )
     rivals = [results.ranked.arms[p] for p in results.best_first[1:]]
-    if rivals:
+    if rivals and results.judged:
         sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))
     return " ".join(sentences)
 

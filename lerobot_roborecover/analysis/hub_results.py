@@ -73,6 +73,8 @@ def results_yaml(board: Board, entry: Entry, dataset_id: str | None = None, sour
         if entry.stopped
         else f"covers {entry.scenarios} of {board.scenarios} scenarios"
         if entry.scenarios < board.scenarios
+        else f"is incomplete ({entry.missing})"
+        if entry.missing
         else ""
     )
     if problem:

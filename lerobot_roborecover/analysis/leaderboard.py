@@ -22,6 +22,7 @@ from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.groups import macro_estimates
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
+from lerobot_roborecover.analysis.labels import tell_settings_apart
 from lerobot_roborecover.analysis.logs import clock_of
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import Panel, make_panel
@@ -31,6 +32,7 @@ from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.env.policy_settings import settings_of_method
 from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
@@ -86,6 +88,8 @@ class Entry:
     """SD between the runs' rates."""
     stopped: bool = False
     """Whether its run ended when a sequential comparison was decided; it has no rank."""
+    missing: str = ""
+    """What it lacks of what its runs were to evaluate, as far as the rows say."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,7 @@ def make_leaderboard(
     groups: dict[tuple, dict[tuple, dict[tuple, tuple[TrialRow, str]]]] = {}
     contradicted: dict[tuple, str] = {}
     logs: dict[tuple, dict[str, None]] = {}
+    found: list[tuple[Path, str, str, list[TrialRow]]] = []
     for path in files:
         name = str(path.relative_to(folder))
         try:
@@ -163,6 +168,9 @@ def make_leaderboard(
             continue
         if not rows:
             refused.append((name, "it holds no complete row"))
+        found.append((path, name, digest, rows))
+    tell_settings_apart([row for path, _, _, rows in found if path not in run_of_file for row in rows])
+    for path, name, digest, rows in found:
         method, run = run_of_file.get(path, ("", ""))
         for row in rows:
             run_of[id(row)] = run
@@ -217,7 +225,9 @@ def _board_key(row: TrialRow) -> tuple:
 
 def _entry_key(row: TrialRow, method: str) -> tuple:
     who = (method, None) if method else (row.policy, row.run_seed)
-    return *who, row.execution_horizon, repr(sorted(row.options.items(), key=str))
+    settings = settings_of_method(row.policy_settings) if method else row.policy_settings
+    own = repr(sorted(row.options.items(), key=str)), repr(sorted(settings.items(), key=str))
+    return *who, row.execution_horizon, *own
 
 
 def _methods(folder: Path, files: Sequence[Path], methods: Sequence[str]) -> dict[Path, tuple[str, str]]:
@@ -278,10 +288,11 @@ def _board(
     rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
     run = (panel.trials > 0).sum(1)
     acting = [any(r.interventions for r in arm.rows) for arm in arms]
+    lacking = [a.missing.words if options.scheduled is None else a.missing.scenarios for a in arms]
     ranked = [
         p
         for p, arm in enumerate(arms)
-        if run[p] == len(panel.scenarios) and not acting[p] and not arm.unreached
+        if run[p] == len(panel.scenarios) and not acting[p] and not arm.unreached and not lacking[p]
     ]
     methods = [method_rate(run_rates(a, panel, p, options.scheduled), draws) for p, a in enumerate(arms)]
     best = max(ranked, key=lambda p: rsr[p].value) if ranked else None
@@ -314,9 +325,13 @@ def _board(
                 other_runs=methods[p].other_runs,
                 run_sd=methods[p].sd,
                 stopped=arms[p].unreached,
+                missing=lacking[p],
             )
         )
-    entries.sort(key=lambda e: (e.interventions, e.scenarios < len(panel.scenarios), -e.rsr.value, e.policy))
+    whole = len(panel.scenarios)
+    entries.sort(
+        key=lambda e: (e.interventions, e.scenarios < whole or bool(e.missing), -e.rsr.value, e.policy)
+    )
     name = f"{dataset}, {split}{kind}"
     digest = hashlib.sha256("\n".join(f"{i} {h}" for i, h in sorted(scenario_set)).encode()).hexdigest()[:12]
     board = Board(

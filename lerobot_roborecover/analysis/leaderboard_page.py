@@ -83,7 +83,7 @@ def _standing(entry: Entry, rank: str) -> str:
     if entry.stopped:
         return "stopped early"
     if not rank:
-        return "incomplete"
+        return f"incomplete: {entry.missing}" if entry.missing else "incomplete"
     if entry.verdict is None:
         return "best"
     if separated(entry):

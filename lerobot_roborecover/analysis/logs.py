@@ -21,8 +21,10 @@ from lerobot_roborecover.analysis.arms import (
 )
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.fork_gain import FORK
+from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
@@ -101,6 +103,8 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
             raise RowsError(
                 f"{path} holds {len(log.policies)} policies ({', '.join(log.policies)}): no one NAME fits"
             )
+        if name:
+            _check_one_setting(log, name)
         if any(FORK in row.options for row in log.rows):
             raise RowsError(
                 f"{path} holds forks of other trials, which say nothing of a policy at the recovery point: "
@@ -124,6 +128,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
         remarks.append(f"{twice} row(s) occur in more than one log with the same result; each counts once")
     kept = [row for row in rows.values() if platform is None or row.platform == platform]
     del rows
+    tell_settings_apart([row for row in kept if id(row) not in run_of])
     if not kept:
         where = ", ".join(str(log.path) for log in found)
         raise RowsError(f"no trial rows{f' of {platform}' if platform else ''} in {where}")
@@ -133,11 +138,24 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     remarks += _revisions(kept, found)
     remarks += _render_qualities(kept)
     remarks += _clocks(kept)
+    remarks += _unknown_weights(kept)
     remarks += _check_versions(kept)
     check_runs(kept, runs, run_of)
     arms = stopped(arms_of(kept, runs, run_of), records)
     remarks += arm_remarks(arms) + sequential_remarks(arms, records)
     return Study(kept[0].platform, arms, tuple(remarks), tuple(log.path for log in found), tuple(records))
+
+
+def _check_one_setting(log: ReadLog, name: str) -> None:
+    """Refuses a log whose one NAME would hide that its policy had several settings."""
+    known = [row for row in log.rows if row.first_state]
+    for row in known:
+        if row.policy_settings != known[0].policy_settings:
+            differences = settings_differences(known[0].policy_settings, row.policy_settings)
+            raise RowsError(
+                f"{log.path} holds trials of {log.policies[0]} under several settings ({differences}): no "
+                f"one NAME fits. Name the log alone, without {name}=, and they are told apart"
+            )
 
 
 def _place(row: TrialRow, logs: Sequence[ReadLog]) -> str:
@@ -280,6 +298,15 @@ def clock_of(row: TrialRow) -> str:
     latency = row.options.get("latency_s")
     what = f"{latency:g} s an inference" if isinstance(latency, int | float) else "inferences as measured"
     return f"real time ({what}, {meanwhile})"
+
+
+def _unknown_weights(rows: Sequence[TrialRow]) -> list[str]:
+    """A remark for each policy on a server that does not say which weights it has."""
+    unknown = [r.policy for r in _apart(rows, "policy_settings") if UNKNOWN_WEIGHTS in r.policy_settings]
+    return [
+        f"{policy}: the server's weights are not known, so its trials may be of several checkpoints"
+        for policy in dict.fromkeys(unknown)
+    ]
 
 
 def _clocks(rows: Sequence[TrialRow]) -> list[str]:

@@ -27,7 +27,7 @@ from lerobot_roborecover.analysis.trial_metrics import trial_metrics
 from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.variance import variance_split
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
-from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.scenario import Outcome, Start
 
 _NAN = float("nan")
 _NOBODY = Estimate(_NAN, _NAN, _NAN)
@@ -80,7 +80,7 @@ def overall(results: Results) -> Table:
     paper, paper_macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws)
     rows = [
         (
-            policy, initial[p], rsr[p], macro[p], retention[p], int((panel.trials[p] > 0).sum()),
+            policy, initial[p], rsr[p], macro[p], retention[p], _scenarios(results, p),
             int(panel.trials[p].sum()), int(panel.invalid[p].sum()), float(valid[p]), tasks[p], paper[p],
             paper_macro[p] if not math.isnan(macro[p].value) else _NOBODY,
         )
@@ -106,8 +106,17 @@ def overall(results: Results) -> Table:
         f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not (docs/report.md); "
         f"they speak of {ESTIMAND[panel.unit(results.options.cluster)]}. {_of_tasks(results)}Percentile "
         f"bootstrap, as in the paper: {draws.draws} draws, seed {draws.seed}, to compare with the paper.",
+        *(f"Incomplete: {arm.title}: {arm.missing.words}." for arm in results.arms if arm.missing),
     )
     return Table("overall", "Overall results", columns, tuple(rows), notes)
+
+
+def _scenarios(results: Results, p: int) -> str | int:
+    """Scenarios that a policy was run on; with how many it was to be run on, where that is more."""
+    count = int((results.recovery.trials[p] > 0).sum())
+    (arm,) = (a for a in results.study.of(Start.RECOVERY) if a.title == results.recovery.arms[p])
+    wanted = max((row.run_scenarios or 0 for row in arm.rows), default=0)
+    return f"{count} of {wanted}" if arm.missing.scenarios and wanted > count else count
 
 
 def _of_tasks(results: Results) -> str:

@@ -103,6 +103,16 @@ class Results:
         return [of[title] for title in self.recovery.arms]
 
     @cached_property
+    def lacking(self) -> Mapping[int, str]:
+        """What incomplete policies lack of what they were to be run on, by index; none has a verdict."""
+        return _lacking(self._direct, self.options)
+
+    @property
+    def judged(self) -> bool:
+        """Whether the ranked policies are complete, or the user has asked for what they share."""
+        return not any(p in self.lacking for p in self.compared.policies)
+
+    @cached_property
     def ranked(self) -> Panel:
         """The complete policies on the scenarios that all of them were run on: headline, ranking, oracle."""
         return self.recovery.take(self.compared.policies, self.compared.scenarios)
@@ -150,7 +160,13 @@ class Results:
             (chosen[k], chosen[m]): c
             for (k, m), c in zip(
                 combinations(range(len(chosen)), 2),
-                contrasts(self.ranked.rates, self.ranked.arms, self.ranked_draws, unit=self.unit),
+                contrasts(
+                    self.ranked.rates,
+                    self.ranked.arms,
+                    self.ranked_draws,
+                    unit=self.unit,
+                    complete=self.judged,
+                ),
                 strict=True,
             )
         }
@@ -228,7 +244,11 @@ class Results:
         pairs = [(arm, base) for base, arm in self.intervention_pairs]
         draws = self.resample(panel)
         run = panel.trials > 0
-        whole = [bool((run[a] == run[b]).all()) for a, b in pairs]
+        of = {arm.title: arm for arm in self.study.arms}
+        lacking = _lacking([of[title] for title in panel.arms], self.options)
+        whole = [
+            bool((run[a] == run[b]).all()) and not {a, b} & lacking.keys() for a, b in pairs
+        ]  # fmt: skip
         inside = [pair for pair, ok in zip(pairs, whole, strict=True) if ok]
         outside = [pair for pair, ok in zip(pairs, whole, strict=True) if not ok]
         found = {
@@ -284,8 +304,9 @@ class Results:
 
     @property
     def matched(self) -> list[int]:
-        """Indices of the ranked policies with trials from both starts on the same scenarios."""
-        return list(self._matched.policies) if self._matched.scenarios else []
+        """Indices of the ranked policies with trials from both starts on the same scenarios; none where the
+        ranked ones are incomplete."""
+        return list(self._matched.policies) if self._matched.scenarios and self.judged else []
 
     @property
     def both_starts(self) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], Resampling]:
@@ -382,7 +403,19 @@ def _compared(panel: Panel, direct: Sequence[Arm], options: Options) -> Compared
     early = np.array([arm.unreached for arm in direct])
     if early.any() and not early.all():
         run = run & ~early[:, None]
-    return compared(run, panel.arms, common=options.common and not early.any())
+    lacking = _lacking(direct, options)
+    return compared(run, panel.arms, common=options.common and not early.any(), lacking=lacking)
+
+
+def _lacking(arms: Sequence[Arm], options: Options) -> dict[int, str]:
+    """What each incomplete arm lacks, by index. Where `--trials` says how many trials were scheduled, those
+    without a row are failures; the logs of a sequential comparison are still growing."""
+    if options.common or options.sequential:
+        return {}
+    found = {p: arm.missing for p, arm in enumerate(arms) if arm.missing}
+    if options.scheduled is not None:
+        return {p: lack.scenarios for p, lack in found.items() if lack.scenarios}
+    return {p: lack.words for p, lack in found.items()}
 
 
 def _initial_remarks(direct: Sequence[Arm], initial: Sequence[Arm]) -> list[str]:

@@ -91,8 +91,9 @@ def verdict_text(contrast: Contrast) -> str:
         return f"{ahead} is better, by {points}."
     if found is ComparisonVerdict.INCOMPLETE:
         return (
-            "No verdict: one of the two was not run on all the scenarios of the comparison, and what it "
-            f"lacks may be no accident. On the {contrast.scenarios} that both were run on, "
+            "No verdict: one of the two was not run on all the scenarios of the comparison, or not on all "
+            "that its run asked for, and what it lacks may be no accident. "
+            f"On the {contrast.scenarios} that both were run on, "
             + (f"{ahead} is ahead by {points}. " if d else "neither is ahead. ")
             + "Evaluate the rest, or ask for the common scenarios with --common."
         )

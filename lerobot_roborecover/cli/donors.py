@@ -66,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     """Chooses, runs, judges, writes; prints the funnel."""
     import json
 
+    from lerobot_roborecover.analysis.labels import tell_settings_apart
     from lerobot_roborecover.curation import donors
     from lerobot_roborecover.curation.attrition import StageCounts
     from lerobot_roborecover.curation.normalisation import use_statistics_of
@@ -81,6 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and any(args.out.iterdir()):
         raise ScenarioError(f"{args.out} is not an empty folder")
     rows = [row for log in args.logs for row in read_trial_log(log)]
+    tell_settings_apart(rows)
     names = {row.policy for row in rows}
     base, *alike = (p if p in names else policy_identity(p) for p in (args.base, *args.deterministic))
     trials = [t for folder in args.trials_from for t in read_trials(folder)]

@@ -6,6 +6,7 @@ be replayed: for the monitor's frames, or as a demonstration. A rerun goes on wh
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_roborecover.env.facts import facts_of
+from lerobot_roborecover.env.policy_settings import digest_of
 from lerobot_roborecover.env.run import open_run
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions, read_actions
@@ -24,12 +26,15 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 if TYPE_CHECKING:
     from lerobot_roborecover.env.configs import RecoveryEnvConfig
 
 TRIALS_FILE = "trials.jsonl"
+CURRENT_FILE = "current.json"
+"""Which of the log's rows are those of the last run: the others are of other files, options or seeds."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,7 @@ def run_trials(
     from lerobot_roborecover.trials import load
 
     config = load.policy_config(policy, policy_options, device)
-    facts = facts_of(config, n_episodes=trials)
+    facts = facts_of(config, rename_map=rename_map, n_episodes=trials)
     env.trial_log = str(folder / TRIALS_FILE)
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
@@ -94,6 +99,7 @@ def run_trials(
     units = units_of(sorted(chosen, key=lambda s: s.id), trials)
     hash_ = run.protocol.config_hash()
     keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
+    write_whole(folder / CURRENT_FILE, json.dumps({"config_hash": hash_}) + "\n")
     run.pool.acquire()
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
@@ -133,12 +139,27 @@ def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
 
 
 def read_trials(folder: Path) -> list[PolicyTrial]:
-    """Trials that `run_trials` left in a folder, whatever their protocol.
+    """Trials that `run_trials` left in a folder: those of its last run's policy, options and seed.
 
     Raises:
-        TrialLogError, ScenarioError: the log or the actions are damaged.
+        TrialLogError, ScenarioError: the log or the actions are damaged, or the folder does not say which of
+            several policies or settings it is about.
     """
-    return [_with_actions(row, folder / ACTIONS_FOLDER) for row in read_trial_log(folder / TRIALS_FILE)]
+    rows = read_trial_log(folder / TRIALS_FILE)
+    current = folder / CURRENT_FILE
+    if current.is_file():
+        try:
+            hash_ = json.loads(current.read_bytes())["config_hash"]
+        except (OSError, ValueError, TypeError, KeyError) as err:
+            raise ScenarioError(f"{current} cannot be read ({err!r}); remove it, or {folder}") from None
+        rows = [row for row in rows if row.config_hash == hash_]
+    kinds = {digest_of([row.policy, row.policy_settings]) for row in rows if row.first_state}
+    if len(kinds) > 1:
+        raise ScenarioError(
+            f"{folder} holds trials of {len(kinds)} policies, or of one under several settings, which would "
+            f"be mixed. Keep one in it, or name folders that hold one each"
+        )
+    return [_with_actions(row, folder / ACTIONS_FOLDER) for row in rows]
 
 
 def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> RecoveryEnvConfig:

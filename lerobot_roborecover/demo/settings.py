@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
+from lerobot_roborecover.env.identity import policy_identity
 from lerobot_roborecover.whole import write_whole
 
 SCENARIOS = "metaworld_starter"
@@ -76,6 +77,7 @@ def claim_folder(settings: DemoSettings) -> None:
     fixed = {
         "schema": _SCHEMA,
         "policy": settings.policy,
+        "identity": policy_identity(settings.policy),
         "scenarios": settings.scenarios,
         "obs_type": settings.obs_type,
     }

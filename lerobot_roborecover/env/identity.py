@@ -1,89 +1,219 @@
-"""How trial rows name a policy: by content, so that a folder's new contents are a new policy."""
+"""How trial rows name a policy: by content, so that one changed byte of a checkpoint makes another policy.
+
+A local folder is hashed whole. A Hub checkpoint is named by its commit. A policy object is hashed with its
+weights, buffers, configuration and processors.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_SAMPLE_BYTES = 2**20
-_HASH_WHOLE_BELOW = 256 * 2**20
-_SAMPLED_VALUES = 1024
+from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER
+
+ADAPTER_FILE = "adapter_config.json"
+_LENGTH = 12
+"""Digits of a hash in a policy's name."""
+_NEVER_LOADED = ("train_config.json", "eval_info.json", "LICENSE", "__pycache__")
+"""Names within a checkpoint's folder that no loader reads. Everything else counts."""
+_NEVER_LOADED_SUFFIXES = (".md", ".jsonl", ".log", ".mp4", ".png", ".jpg", ".gif", ".html")
+"""Kinds of files that no loader reads: cards, logs, pictures."""
+_RESULTS = ("trials.jsonl", "eval_info.json")
+"""Files of an evaluation's output folder, which may lie within the checkpoint's."""
+_NO_SOURCES = ("pretrained_path", "repo_id", "name_or_path", "_name_or_path")
+"""Fields of a saved configuration that name a place which nothing is loaded from any more."""
+_SETTLED_NS = 2 * 10**9
+"""A file that changed less than this ago may change again within one tick of its file system's clock."""
+_hashes: dict[tuple[str, int, int, int], str] = {}
 
 
-def policy_identity(path: str) -> str:
-    """How trial rows name a checkpoint: a local folder by name and content hash, a Hub checkpoint by id and
-    commit."""
-    folder = _snapshot_folder(path)
-    if folder is None:
-        return path
-    if not Path(path).is_dir():
-        return f"{path}@{folder.name[:12]}"
-    digest = hashlib.sha256()
-    for name in ("config.json", "model.safetensors", "adapter_model.safetensors"):
-        file = folder / name
-        if file.is_file():
-            digest.update(name.encode())
-            _hash_file(file, digest)
-    name = folder.resolve().name
-    if name == "pretrained_model":  # lerobot-train's checkpoints/<step>/pretrained_model
-        name = "/".join(folder.resolve().parts[-4:-1])
-    return f"{name}@{digest.hexdigest()[:12]}"
-
-
-def weights_identity(policy: Any) -> str:
-    """Names a policy that is not on disk: its type, and a hash of its weights.
+def policy_identity(path: str | Path, revision: str | None = None) -> str:
+    """Returns how trial rows name a checkpoint.
 
     Args:
-        policy: a torch module; of every tensor some thousand values are looked at, spread over it, which
-            training changes.
+        path: a local folder, named by its own name and the hash of every file that it is loaded from (an
+            adapter's base, and local folders that its configuration names, included); or a Hub id, named by
+            its commit.
+        revision: commit, tag or branch of a Hub id.
     """
+    text = str(path)
+    local = Path(text).expanduser()
+    if local.is_dir():
+        return f"{_folder_name(local)}@{content_hash(local)[:_LENGTH]}"
+    folder = snapshot_folder(text, revision)
+    if folder is None:
+        return text if revision is None else f"{text}@{revision}"
+    base = _adapter_base(folder)
+    return f"{text}@{folder.name[:_LENGTH]}" + (f"+{base}" if base else "")
+
+
+def policy_name(path: str | Path) -> str:
+    """Returns a checkpoint's name in `policy_identity`, without its hash."""
+    local = Path(path).expanduser()
+    return _folder_name(local) if local.is_dir() else str(path)
+
+
+def content_hash(path: Path) -> str:
+    """Returns the SHA-256 of a file, or of a checkpoint's folder with all that it is loaded from."""
+    return _content_hash(path, frozenset())
+
+
+def file_sha256(file: Path) -> str:
+    """Returns the SHA-256 of a file's whole content. A process reads an unchanged file once."""
+    stat = file.stat()
+    key = (str(file.resolve()), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+    found = _hashes.get(key)
+    if found is None:
+        with open(file, "rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > _SETTLED_NS:
+            _hashes[key] = found
+    return found
+
+
+def object_identity(policy: Any, processors: tuple[Any, ...] = ()) -> str:
+    """Returns the name of a policy that is not on disk: its type, and a hash of everything that it holds.
+
+    Args:
+        policy: a torch module. All of its weights and buffers count, and its configuration.
+        processors: its pre- and postprocessor, whose settings and statistics count.
+    """
+    from lerobot_roborecover.env.policy_settings import result_fields
+
     digest = hashlib.sha256()
-    for name, tensor in sorted(policy.state_dict().items()):
-        flat = tensor.detach().flatten()
-        sample = flat[:: max(flat.numel() // _SAMPLED_VALUES, 1)].double().cpu().numpy()
-        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode() + sample.tobytes())
-    kind = getattr(policy.config, "type", type(policy).__name__)
-    return f"{kind}@{digest.hexdigest()[:12]}"
+    # `state_dict` leaves out buffers that are not persistent.
+    tensors = {**dict(policy.named_buffers()), **policy.state_dict()}
+    _add_tensors(digest, tensors)
+    config = getattr(policy, "config", None)
+    if config is not None:
+        _add_json(digest, result_fields(config))
+    for processor in processors:
+        for step in getattr(processor, "steps", (processor,)):
+            digest.update(f"{type(step).__module__}.{type(step).__qualname__}".encode())
+            if hasattr(step, "get_config"):
+                _add_json(digest, {k: v for k, v in step.get_config().items() if k != "device"})
+            if hasattr(step, "state_dict"):
+                _add_tensors(digest, step.state_dict())
+    kind = getattr(config, "type", type(policy).__name__)
+    return f"{kind}@{digest.hexdigest()[:_LENGTH]}"
 
 
-def saved_config(path: str | None) -> dict[str, Any]:
-    """A checkpoint's configuration; empty where there is none to read."""
-    folder = _snapshot_folder(path) if path else None
+def saved_config(path: str | Path | None, revision: str | None = None) -> dict[str, Any]:
+    """Returns a checkpoint's configuration as it was saved; empty where there is none to read."""
+    folder = snapshot_folder(str(path), revision) if path else None
     if folder is None:
         return {}
+    return _read_json(folder / "config.json")
+
+
+def snapshot_folder(path: str, revision: str | None = None) -> Path | None:
+    """Returns the folder that a policy is loaded from: a local one, or one in the Hub cache, which gets the
+    configuration's current commit first. None where there is no such checkpoint."""
+    folder = Path(path).expanduser()
+    if folder.is_dir():
+        return folder
+    if "/" not in path:  # no Hub id: the kind of a detector
+        return None
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+    for name in ("config.json", ADAPTER_FILE):
+        try:
+            return Path(hf_hub_download(path, name, revision=revision)).parent
+        except (HFValidationError, HfHubHTTPError, LocalEntryNotFoundError, OSError):
+            continue
+    return None
+
+
+def _content_hash(path: Path, above: frozenset[Path]) -> str:
+    """The hash of a file or folder; `above` are the folders whose configurations led here."""
+    if path.is_file():
+        return file_sha256(path)
+    above |= {path.resolve()}
+    digest = hashlib.sha256()
+    for file in sorted(_loaded_files(path), key=lambda f: f.relative_to(path).as_posix()):
+        digest.update(f"{file.relative_to(path).as_posix()} {file_sha256(file)}\n".encode())
+        if file.suffix == ".json" and file.parent == path:
+            config = _read_json(file)
+            for source in _named_sources(config) if file.name == "config.json" or "steps" in config else ():
+                if source.resolve() not in above:
+                    digest.update(f"{file.name} names {_content_hash(source, above)}\n".encode())
+    base = _adapter_base(path, above)
+    digest.update(base.encode())
+    return digest.hexdigest()
+
+
+def _loaded_files(folder: Path) -> Iterator[Path]:
+    """Files of a checkpoint's folder that a loader may read."""
+    for path in folder.iterdir():
+        name = path.name
+        if name.startswith(".") or name in _NEVER_LOADED or path.suffix in _NEVER_LOADED_SUFFIXES:
+            continue
+        if path.is_dir():
+            if path.is_symlink() and folder.resolve().is_relative_to(path.resolve()):
+                continue  # a link to a folder above
+            results = any((path / result).exists() for result in _RESULTS)
+            if not results and not (name == ACTIONS_FOLDER and any(folder.glob("*.jsonl"))):
+                yield from _loaded_files(path)
+        elif path.is_file():
+            yield path
+
+
+def _named_sources(value: Any) -> Iterator[Path]:
+    """Existing files and folders that a configuration names by a path with a slash: a tokenizer's, a
+    backbone's."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if key not in _NO_SOURCES:
+                yield from _named_sources(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _named_sources(item)
+    elif isinstance(value, str) and "/" in value and len(value) < 4096 and "\0" not in value:
+        path = Path(value).expanduser()
+        if path.is_dir() or path.is_file():
+            yield path
+
+
+def _adapter_base(folder: Path, above: frozenset[Path] = frozenset()) -> str:
+    """The identity of the policy that an adapter was trained on; empty where the folder holds no adapter."""
+    config = _read_json(folder / ADAPTER_FILE)
+    base = config.get("base_model_name_or_path")
+    if not isinstance(base, str) or not base:
+        return ""
+    local = Path(base).expanduser()
+    if local.is_dir():
+        return "" if local.resolve() in above else _content_hash(local, above)[:_LENGTH]
+    return policy_identity(base, config.get("revision"))
+
+
+def _folder_name(folder: Path) -> str:
+    folder = folder.resolve()
+    if folder.name == "pretrained_model":  # lerobot-train's checkpoints/<step>/pretrained_model
+        return "/".join(folder.parts[-4:-1])
+    return folder.name
+
+
+def _read_json(file: Path) -> dict[str, Any]:
     try:
-        loaded = json.loads((folder / "config.json").read_text())
-    except (OSError, ValueError):
+        loaded = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return {}
     return loaded if isinstance(loaded, dict) else {}
 
 
-def _snapshot_folder(path: str) -> Path | None:
-    """The folder a policy is loaded from: local, or in the Hub cache that LeRobot has just filled."""
-    folder = Path(path)
-    if folder.is_dir():
-        return folder
-    from huggingface_hub import try_to_load_from_cache
-    from huggingface_hub.errors import HFValidationError
+def _add_tensors(digest: hashlib._Hash, tensors: dict[str, Any]) -> None:
+    import torch
 
-    try:
-        cached = try_to_load_from_cache(path, "config.json")
-    except HFValidationError:
-        return None
-    return Path(cached).parent if isinstance(cached, str) else None
+    for name, tensor in sorted(tensors.items()):
+        value = torch.as_tensor(tensor).detach().cpu().contiguous()
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}\n".encode())
+        digest.update(memoryview(value.reshape(-1).view(torch.uint8).numpy()))
 
 
-def _hash_file(file: Path, digest: hashlib._Hash) -> None:
-    """Whole content of small files; size, start, end and 62 samples between of large ones (a second, not a
-    minute)."""
-    size = file.stat().st_size
-    with open(file, "rb") as stream:
-        if size <= _HASH_WHOLE_BELOW:
-            digest.update(stream.read())
-            return
-        digest.update(str(size).encode())
-        for index in range(64):
-            stream.seek((size - _SAMPLE_BYTES) * index // 63)
-            digest.update(stream.read(_SAMPLE_BYTES))
+def _add_json(digest: hashlib._Hash, value: Any) -> None:
+    digest.update(json.dumps(value, sort_keys=True, default=str).encode())

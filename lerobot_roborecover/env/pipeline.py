@@ -29,6 +29,7 @@ def callers_facts(env: Any) -> RunFacts:
         return RunFacts()
     return facts_of(
         config.policy,
+        rename_map=config.rename_map,
         n_episodes=config.eval.n_episodes,
         batch_size=config.eval.batch_size,
         lerobots_batch=config.eval.batch_size == EvalConfig(n_episodes=config.eval.n_episodes).batch_size,

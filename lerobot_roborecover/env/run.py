@@ -200,6 +200,7 @@ def open_run(
         policy=facts.policy,
         run_seed=None,
         execution_horizon=facts.execution_horizon,
+        policy_settings=facts.policy_settings,
         options=decisive,
         versions={name: installed(name) or "" for name in required(platform)},
     )
@@ -209,6 +210,8 @@ def open_run(
         "RoboRecover: %d scenarios of %s%s from %s; trial log %s (%d rows already there)",
         len(scenarios), scenarios.source, trials, start.value, log.path, len(log),
     )  # fmt: skip
+    for remark in log.other_rows(protocol):
+        logger.warning("%s", remark)
     if log.dropped_bytes:
         logger.warning("dropped a last line of %d bytes that a crash had cut off", log.dropped_bytes)
     folder, shared = options.snapshot_dir, None
@@ -226,7 +229,7 @@ def open_run(
         dataset=scenarios.source,
         dataset_revision=scenarios.revision,
         handoff_check=options.handoff_check,
-        extent=RunExtent(selected, facts.n_episodes, options.shard),
+        extent=RunExtent(selected, facts.n_episodes, "{}/{}".format(*options.shard_of())),
         picture=spec.picture,
         intervention=facts.intervention,
         real_time=real_time,

@@ -10,16 +10,18 @@ from __future__ import annotations
 import gc
 import json
 import os
+import re
 import sys
 import typing
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from lerobot_roborecover.env.trial_check import MAX_LINE_BYTES, FieldProblem, RowChecker, parse_json
-from lerobot_roborecover.env.trial_row import TrialRow, row_of
+from lerobot_roborecover.env.trial_row import Protocol, TrialRow, row_of
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.journal import AppendOnly, InUseError, append_records, complete_lines
 from lerobot_roborecover.scenario import Outcome
@@ -159,6 +161,23 @@ class Finished(NamedTuple):
     steps: int
 
 
+class _Kind(NamedTuple):
+    """What the rows of one policy, start and setting share."""
+
+    policy: str
+    """Without its hash."""
+    start: str
+    config_hash: str
+    run_seed: int | None
+    recorded: bool
+    """Whether they say all of their policy's files and options, as rows since schema 3 do."""
+
+
+def _nameless(policy: str) -> str:
+    """A policy's name without the hashes and commits in it."""
+    return re.sub(r"@[0-9a-f]{6,40}\b", "", policy)
+
+
 class RowLog(typing.Protocol):
     """Where a run's rows go."""
 
@@ -198,6 +217,7 @@ class TrialLog:
                 "(--env.trial_log) and merge them afterwards"
             ) from None
         self._done: dict[tuple, Finished] = {}
+        self._kinds: Counter[_Kind] = Counter()
         try:
             for _, row in _checked_rows(self._file.lines(MAX_LINE_BYTES), str(self.path)):
                 self._remember(row)
@@ -217,6 +237,38 @@ class TrialLog:
     def find(self, key: tuple) -> Finished | None:
         """How a trial ended that is already done, else None."""
         return self._done.get(key)
+
+    def other_rows(self, protocol: Protocol) -> list[str]:
+        """Returns a line for each kind of rows of this policy and start that a run of the protocol does not
+        reuse, or reuses although nothing says whose they are."""
+        other = earlier = unnamed = 0
+        for kind, count in self._kinds.items():
+            if (kind.policy, kind.start) != (_nameless(protocol.policy), protocol.start):
+                continue
+            if not kind.recorded:
+                earlier += count
+            elif kind.config_hash != replace(protocol, run_seed=kind.run_seed).config_hash():
+                other += count
+            elif protocol.policy == "unknown":
+                unnamed += count
+        found = []
+        if unnamed:
+            found.append(
+                f"nothing says which policy this run has: {unnamed} row(s) in {self.path}, of a run that did "
+                "not say it either, are taken for its own. Give each policy a log of its own "
+                "(--env.trial_log)"
+            )
+        if other:
+            found.append(
+                f"{other} row(s) of this policy under other settings are in {self.path} and are not reused"
+            )
+        if earlier:
+            found.append(
+                f"{earlier} row(s) of this policy in {self.path} were written by an earlier version, do not "
+                "say which files and options the policy had, and are not reused; to keep them apart, give "
+                "this run a log of its own (--env.trial_log)"
+            )
+        return found
 
     def append(self, row: TrialRow) -> None:
         """Writes a row and waits until it is on disk."""
@@ -253,6 +305,11 @@ class TrialLog:
         self._done[tuple(sys.intern(p) if isinstance(p, str) else p for p in row.key())] = Finished(
             row.success, row.steps
         )
+        if "fork" not in row.options:  # forks are trials of their own
+            kind = _Kind(
+                _nameless(row.policy), row.start, row.config_hash, row.run_seed, row.first_state != ""
+            )
+            self._kinds[kind] += 1
 
     def close(self) -> None:
         """Releases the file."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim.optimizers import OptimizerConfig
@@ -63,6 +64,11 @@ class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
     """Who stands in for `human`: `package.module:function`, which returns an
     `interventions.driver.Driver`."""
     push_to_hub: bool = False
+
+    counted_elsewhere: ClassVar[tuple[str, ...]] = (
+        "base", "correction", "monitor", "mode", "correction_steps", "rewind_steps", "driver",
+    )  # fmt: skip
+    """Fields that `env.facts.intervention_facts` says by content, in `TrialRow.options`."""
 
     def check(self) -> None:
         """Refuses what cannot be used; not while parsing, where draccus would bury the message.

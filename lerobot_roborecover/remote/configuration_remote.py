@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.optim.optimizers import OptimizerConfig
@@ -45,6 +46,23 @@ class RemoteConfig(NotTrained, PreTrainedConfig):
     """Times in a row that nobody answered after which the run stops; 0 never stops."""
     max_frame_mb: int = 64
     """Of an answer."""
+
+    counted_elsewhere: ClassVar[tuple[str, ...]] = (
+        "url", "name", "mapping", "connections", "timeout_s", "wait_s", "reconnect_s", "give_up_after",
+        "max_frame_mb",
+    )  # fmt: skip
+    """Fields that change no result, or that `trial_settings` and the policy's name say by content."""
+
+    def trial_settings(self) -> dict[str, Any]:
+        """Returns what decides a trial beside the options: the mapping's content, and who the server says it
+        is, which asks the server.
+
+        Raises:
+            RemoteError: the mapping cannot be used, or no server answers.
+        """
+        from lerobot_roborecover.remote.identity import remote_settings
+
+        return remote_settings(self)
 
     def __post_init__(self) -> None:
         self.device = "cpu"  # what arrives here goes to the network, not to a GPU

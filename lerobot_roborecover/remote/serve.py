@@ -14,7 +14,9 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.env.command_line import run_with_arguments
+from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.policy_settings import digest_of
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.threads import fit_threads
@@ -123,7 +125,12 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
         "rename_observations_processor": {"rename_map": rename_map},
     }
     with plain_loading(f"--policy.path={path}"):
-        pre, post = make_pre_post_processors(config, pretrained_path=path, preprocessor_overrides=overrides)
+        pre, post = make_pre_post_processors(
+            config,
+            pretrained_path=path,
+            pretrained_revision=config.pretrained_revision,
+            preprocessor_overrides=overrides,
+        )
     return ServedPolicy(policy, pre, post, rename_map, max_batch)
 
 
@@ -143,8 +150,11 @@ def serve(cfg: ServeConfig) -> int:
         cfg.host, cfg.port, cfg.batch_delay_ms / 1e3, cfg.max_frame_mb * 2**20, cfg.max_sessions,
         api_key(), cfg.certfile, cfg.keyfile,
     )  # fmt: skip
+    facts = facts_of(policy, rename_map=cfg.rename_map)  # before loading fills in anything
+    told = digest_of([facts.policy, facts.policy_settings])
     served = load_served(policy, cfg.rename_map, cfg.max_batch)
-    server = PolicyServer(served, public_name(str(policy.pretrained_path)), options)
+    name = public_name(str(policy.pretrained_path))
+    server = PolicyServer(served, name, options, f"{name}@{told}")
     if policy.type == "xvla":
         logger.warning(
             "lerobot-eval gives X-VLA processors of its own on LIBERO, which a client does not know: its "

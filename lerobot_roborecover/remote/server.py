@@ -164,11 +164,12 @@ class PolicyServer:
         policy: what is asked.
         name: of the policy, for clients and the log.
         options: where, and how much.
+        identity: of the policy's files and options, for clients.
     """
 
-    def __init__(self, policy: ServedPolicy, name: str, options: ServeOptions):
+    def __init__(self, policy: ServedPolicy, name: str, options: ServeOptions, identity: str = ""):
         self._policy, self._options = policy, options
-        self._metadata = policy.metadata(name)
+        self._metadata = policy.metadata(name) | ({"identity": identity} if identity else {})
         self._connections = 0
         self.served = 0
         """Inferences answered."""

@@ -26,6 +26,7 @@ from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
 from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
 from lerobot_roborecover.scenario import ScenarioError, Start
 from lerobot_roborecover.study.child import run_module
+from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
 from lerobot_roborecover.whole import write_whole
 
 INITIAL, RECOVERY = str(Start.INITIAL), str(Start.RECOVERY)
@@ -90,6 +91,26 @@ class ReproductionPlan:
             if key == name:
                 value = given
         return None if value is None else str(value)
+
+    def identity(self, start: str) -> dict[str, Any]:
+        """What all rows of an arm's log share, beside what its log's own keys say."""
+        config = yaml.safe_load(self.checkpoint.config.read_text()) or {}
+        arguments = [*self.checkpoint.arguments, *self.arguments]
+        apart = {f"--env.{name}" for name in _SET} | {"--policy.path", "--policy.mapping"}
+        named = [(a.partition("=")[0], a) for a in arguments]
+        pace = {name for name, _ in named if name.startswith("--runner.")} - {"--runner.portable"}
+        given = [a for name, a in named if name not in apart | pace]
+        own = {name: self.option(f"policy.{name}") for name in ("path", "mapping")}
+        env = {name: value for name, value in (config.get("env") or {}).items() if name not in _SET}
+        return identity_of_run(
+            (self.option("env.type") or "").removeprefix(ENV_PREFIX),
+            {**(config.get("policy") or {}), **own},
+            start=start,
+            arguments=given,
+            env=env,
+            seed=config.get("seed"),
+            rename_map=config.get("rename_map"),
+        )
 
     def scenarios(self) -> ScenarioSet:
         """The scenarios that both arms are run on.
@@ -178,15 +199,22 @@ def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callab
     done, argv = folder / "done.json", plan.argv(start)
     length = plan.length(start, scenarios)
     record: dict[str, Any] = json.loads(done.read_text()) if done.is_file() else {}
-    if not (record.get("finished") and record.get("argv") == argv):
+    identity = plan.identity(start)
+    claim_log(log, identity, say)
+    same = record.get("argv") == argv and record.get("identity") == identity
+    if not (record.get("finished") and same):
         say(f"{start}: {length.trials} trials, at most {length.hours:.2g} hours. {plan.command_line(start)}")
         folder.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
         # Checkpoints and scenario sets come from the Hub, unless the caller is offline.
         online = {"HF_HUB_OFFLINE": os.environ.get("HF_HUB_OFFLINE", "0")}
         status = run_module("lerobot_roborecover.cli.main", argv, online)
-        seconds = record.get("seconds", 0.0) + time.monotonic() - began
-        write_whole(done, json.dumps({"argv": argv, "seconds": seconds, "finished": status == 0}))
+        before = record.get("seconds", 0.0) if record.get("identity") == identity else 0.0
+        seconds = before + time.monotonic() - began
+        write_whole(
+            done,
+            json.dumps({"argv": argv, "identity": identity, "seconds": seconds, "finished": status == 0}),
+        )
         record = {"seconds": seconds}
         if status:
             raise ScenarioError(
@@ -195,6 +223,11 @@ def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callab
             )
     ids = {s.id for s in scenarios}
     rows = [r for r in read_trial_log(log) if r.scenario_id in ids and r.trial < plan.trials]
+    if len({row.config_hash for row in rows}) > 1:
+        raise ScenarioError(
+            f"{log} holds {start} trials under several settings, such as of two servers at one address; they "
+            "are never averaged. Move it away, and run the same command again"
+        )
     found = summarise([asdict(row) for row in rows], plan.trials).starts[Start(start)]
     return ArmResult(start, tuple(rows), found, record["seconds"])
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lerobot_roborecover.analysis.make import Gallery, Report, report
 from lerobot_roborecover.analysis.results import Options
@@ -25,6 +26,7 @@ from lerobot_roborecover.study.outcomes import (
     outcomes_of,
     read_outcomes,
 )
+from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
 from lerobot_roborecover.trials.sizes import SLOT_GB
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
@@ -85,6 +87,7 @@ def evaluate(
     def run(arm: StudyArm) -> float:
         began = time.monotonic()
         if not _finished(arm, ids):
+            claim_log(arm.log, _identity(arm), say)
             run_arm(arm, study)
             (arm.out / DONE_FILE).write_text(_what_ran(arm, ids))
         return time.monotonic() - began
@@ -176,4 +179,15 @@ def _finished(arm: StudyArm, ids: Sequence[str]) -> bool:
 
 def _what_ran(arm: StudyArm, ids: Sequence[str]) -> str:
     # With other slots the trials are the same: what has finished is not run again for them.
-    return json.dumps([replace(arm.run, runner={**arm.run.runner, "slots": 0}).config(), ids])
+    run = replace(arm.run, runner={**arm.run.runner, "slots": 0}).config()
+    return json.dumps([run, ids, _identity(arm)], sort_keys=True)
+
+
+def _identity(arm: StudyArm) -> dict[str, Any]:
+    """What all rows of an arm's log share: its policy's files and options, the env's options, and so on."""
+    run = arm.run
+    env = {k: v for k, v in run.env.items() if k not in ("scenarios", "split", "select", "trial_log")}
+    runner = {k: v for k, v in run.runner.items() if k != "slots"}
+    return identity_of_run(
+        run.platform, run.policy, env=env, runner=runner, seed=run.seed, rename_map=dict(run.rename_map)
+    )

@@ -48,7 +48,7 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         arm = names[label]
         row = make_row(
             scenarios[scenario_id],
-            Protocol(arm.start, 0, arm.name, None, None, dict(study.env)),
+            Protocol(arm.start, 0, arm.name, None, None, options=dict(study.env)),
             dataset=study.root.name,
             dataset_revision=None,
             trial=trial,

@@ -154,7 +154,7 @@ def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, Run]:
     """The scenarios and a run whose trial log nobody keeps."""
     folder = TemporaryFolder("check")
     log = f"{folder.path}/trials.jsonl"
-    facts = facts_of(cfg.policy, n_episodes=cfg.eval.n_episodes)
+    facts = facts_of(cfg.policy, rename_map=cfg.rename_map, n_episodes=cfg.eval.n_episodes)
     options = copy(cfg.recovery_env)
     options.trial_log = log
     scenarios, run = open_run(options, options.run_spec(), workers=True, facts=facts)

@@ -25,7 +25,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.env.configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.env.facts import facts_of
-from lerobot_roborecover.env.identity import weights_identity
+from lerobot_roborecover.env.identity import object_identity
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.processors import env_processors
 from lerobot_roborecover.env.run import open_run
@@ -71,8 +71,8 @@ def evaluate(
         processors: pre- and postprocessor of a policy object; without, those saved with its checkpoint.
         rename_map: the environment's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
         device: of a policy that is loaded here; None takes what its configuration says.
-        name: of the policy in the rows. Default: a checkpoint's identity, or an object's type and a hash of
-            its weights.
+        name: of the policy in the rows, whose settings then hold its identity. Default: a checkpoint's
+            identity, or an object's type and a hash of its weights, configuration and processors.
         log: trial log to write to; trials that it holds already are not run again. None keeps none.
         slots: simulators at once; 0 takes what `roborecover eval` would.
         max_batch: observations per inference, at most.
@@ -95,11 +95,12 @@ def evaluate(
     with TemporaryFolder("evaluate") as folder, untouched(module):
         options.trial_log = str(log or folder / "trials.jsonl")
         config = _policy_config(policy, device)
-        called = name or (weights_identity(module) if module is not None else "")
-        facts = facts_of(config, policy=called, n_episodes=trials)
+        spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
+        own = () if module is None else _processors(spec, module, processors)
+        identity = "" if module is None else object_identity(module, own)
+        facts = facts_of(config, policy=name, identity=identity, rename_map=rename_map, n_episodes=trials)
         chosen, run = open_run(options, options.run_spec(), workers=True, facts=facts, scenarios=chosen)
         run.protocol = replace(run.protocol, run_seed=seed)
-        spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
         run.pool.acquire()
         try:
             units = units_of(sorted(chosen, key=lambda s: s.id), trials)
@@ -116,7 +117,7 @@ def evaluate(
                 places = EnginePlaces(
                     slots=slots, device=str(config.device), draws=options.obs_type != "state"
                 )
-                make_host = partial(_host, spec, module, processors)
+                make_host = partial(load_host, spec) if module is None else partial(_host, spec, module, *own)
                 open_engine(run, units, make_host, places, on_row=show).run(units)
             if line is not None:
                 line.show(tally, final=True)
@@ -187,21 +188,25 @@ def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
             f"policy={type(policy).__name__}: give a checkpoint's folder or Hub id, a LeRobot policy or its "
             "configuration"
         )
-    if policy is config and device:
-        config = replace(config, device=device)
-        config.pretrained_path = policy.pretrained_path
+    if policy is config:
+        config = copy(config)  # loading fills in the environment's features
+        config.device = device or config.device
     return config
 
 
-def _host(spec: HostSpec, module: PreTrainedPolicy | None, processors: tuple[Any, Any] | None) -> Host:
-    if module is None:
-        return load_host(spec)
+def _processors(
+    spec: HostSpec, module: PreTrainedPolicy, processors: tuple[Any, Any] | None
+) -> tuple[Any, Any]:
+    """A policy object's pre- and postprocessor."""
     if processors is None and not spec.policy.pretrained_path:
         raise OptionError(
             "processors: a policy that was not loaded from a checkpoint needs its pre- and postprocessor, "
             "which hold the training data's statistics: evaluate(policy, ..., processors=(pre, post))"
         )
-    before, after = processors or load_processors(module.config, spec)
+    return processors or load_processors(module.config, spec)
+
+
+def _host(spec: HostSpec, module: PreTrainedPolicy, before: Any, after: Any) -> Host:
     module.eval()
     env_pre, env_post = env_processors(spec.env, spec.policy)
     if isinstance(module, MakesHost):

@@ -20,6 +20,7 @@ from lerobot_roborecover.env.processors import env_processors
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.host import Host, MakesHost
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
+from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.policies.threads import fit_threads
 from lerobot_roborecover.trials.portable import make_portable
@@ -96,6 +97,7 @@ def _load_host(spec: HostSpec) -> Host:
     fit_threads(spec.policy.device)
     rename_map = dict(spec.rename_map)
     policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
+    _check_trained(spec.policy, policy)
     policy.eval()
     if spec.portable:
         make_portable(policy)
@@ -104,6 +106,17 @@ def _load_host(spec: HostSpec) -> Host:
     if isinstance(policy, MakesHost):
         return policy.make_host(env_pre, env_post, preprocessor, spec.max_batch)
     return PolicyHost(policy, env_pre, env_post, preprocessor, postprocessor, spec.max_batch)
+
+
+def _check_trained(config: PreTrainedConfig, policy: Any) -> None:
+    """Refuses random weights of any policy type; `facts.check_trained` refuses LeRobot's own types sooner."""
+    if config.pretrained_path or isinstance(config, NotTrained):
+        return
+    if any(parameter.requires_grad for parameter in policy.parameters()):
+        raise OptionError(
+            f"policy type {config.type}: its configuration names no checkpoint, so its weights are random. "
+            "Give --policy.path=FOLDER_OR_HUB_ID"
+        )
 
 
 def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
@@ -121,5 +134,6 @@ def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
     return make_pre_post_processors(
         policy_cfg=spec.policy,
         pretrained_path=None if path is None else str(path),
+        pretrained_revision=spec.policy.pretrained_revision,
         preprocessor_overrides=overrides,
     )

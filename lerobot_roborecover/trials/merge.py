@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from lerobot_roborecover.analysis.extent import missing
 from lerobot_roborecover.analysis.sequential_record import record_path
 from lerobot_roborecover.env.trial_log import TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
@@ -23,6 +24,7 @@ def protocol_of(row: TrialRow) -> dict[str, object]:
         "execution horizon": row.execution_horizon,
         "dataset revision": row.dataset_revision,
         **{f"option {name}": value for name, value in sorted(row.options.items())},
+        **{f"policy setting {name}": value for name, value in sorted(row.policy_settings.items())},
         **{f"version of {name}": value for name, value in sorted(row.versions.items())},
     }
 
@@ -68,13 +70,26 @@ def trial_counts(rows: Sequence[TrialRow]) -> dict[tuple[str, str], dict[int, in
     return counts
 
 
+def extent_remarks(rows: Sequence[TrialRow]) -> list[str]:
+    """Returns what each policy's trials from each start lack of what their runs were to evaluate."""
+    groups: dict[tuple[str, str], list[TrialRow]] = {}
+    for row in rows:
+        groups.setdefault((row.policy, row.start), []).append(row)
+    lacking = {key: missing(group) for key, group in groups.items()}
+    return [
+        f"policy {policy}, start {start}: incomplete: {lack.words}. Run the rest, and merge again"
+        for (policy, start), lack in lacking.items()
+        if lack
+    ]
+
+
 @dataclass(frozen=True)
 class Merged:
     """What came together."""
 
     rows: list[TrialRow]
     remarks: tuple[str, ...]
-    """What was left out, and why."""
+    """What was left out, and why; and what is missing."""
 
 
 def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False) -> Merged:
@@ -119,6 +134,7 @@ def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False) -> Merged:
                 "is unfinished or missing: run it with its own log, or accept it with --unequal"
                 + "".join(f". {remark}" for remark in remarks)
             )
+    remarks += extent_remarks(rows)
     rows.sort(key=lambda r: (r.scenario_id, r.start, r.policy, r.trial))
     with new_file(out) as path, open(path, "w", encoding="utf-8") as file:
         file.writelines(json.dumps(asdict(row), allow_nan=False) + "\n" for row in rows)

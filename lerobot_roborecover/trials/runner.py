@@ -15,6 +15,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_roborecover.analysis.extent import missing
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.env.command_line import run_with_arguments
@@ -198,7 +199,13 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             "--videos=N for films"
         )
     out = cfg.folder
-    facts = facts_of(policy, n_episodes=cfg.eval.n_episodes, output_dir=out)
+    facts = facts_of(
+        policy,
+        rename_map=cfg.rename_map,
+        portable=cfg.runner.portable,
+        n_episodes=cfg.eval.n_episodes,
+        output_dir=out,
+    )
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
@@ -313,6 +320,8 @@ def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Seq
     info = eval_info(rows, cfg.recovery_env.group_by, videos)
     (out / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
     print(format_table(summarise([asdict(r) for r in rows])))
+    if lack := missing(rows):
+        print(f"\nincomplete: {lack.words}")
     print(f"\ntrial log {run.kept_log().path}\neval info {out / 'eval_info.json'}")
     if films:
         print(f"videos {films[0].parent} ({len(films)})")

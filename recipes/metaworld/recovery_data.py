@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,14 @@ from lerobot_roborecover.whole import new_folder
 from recipes.commands import evaluate, roborecover
 from recipes.metaworld.dataset import STUDY_TASKS, Episode, create_dataset, save_episode
 from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_demonstrations
+from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.training import Training
 
 STUDY = Path("lerobot_roborecover/data/metaworld_study")
 SCENARIOS = "metaworld_recovery"
 POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}
 """Policies whose recoveries are learned from, and their trials of each training scenario."""
+STORED = OUTCOMES / "recovery_data"
 SEEDS = (0, 1, 2, 3)
 """Of training: four runs are the fewest of which a verdict on methods is given (docs/report.md)."""
 
@@ -231,6 +233,22 @@ def _place(name: str) -> float:
     return _SHAKEN_AT if mixture.shaken else 100 * mixture.recoveries
 
 
+def report(logs: Mapping[str, Path], out: Path) -> None:
+    """Writes and prints the report on the runs' trial logs, and draws the curve where a mixture has several.
+
+    Args:
+        logs: trial logs by run, `MIXTURE_SEED`.
+        out: folder to work in.
+    """
+    by_mixture: dict[str, list[str]] = {name: [] for name in MIXTURES}
+    for run, log in logs.items():
+        by_mixture[run.rpartition("_")[0]].append(str(log))
+    named = [f"{name}={','.join(of)}" for name, of in by_mixture.items() if of]
+    roborecover("report", *named, "--out", out / "report")
+    if len(logs) > len(named):
+        print(f"curve     {draw_curve(out / 'report')}")
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -240,26 +258,28 @@ def main() -> None:
     add("--out", type=Path, required=True, help="folder to work in")
     add("--only", nargs="+", choices=MIXTURES, default=list(MIXTURES), metavar="MIXTURE")
     add("--seeds", nargs="+", type=int, default=list(SEEDS))
+    add("--store", action="store_true", help="keep the outcomes with the code")
+    add("--stored", action="store_true", help="run nothing: report the outcomes kept with the code")
     add("--train-option", nargs="+", default=[], metavar="OPTION", help="of lerobot-train, without dashes")
     args = parser.parse_args()
+    if args.stored:
+        report(stored_logs(STORED), args.out)
+        return
     if not CONFIGS.is_dir():
         parser.error(f"{CONFIGS} is not here: run this in the top folder of a checkout of the repository")
     args.out.mkdir(parents=True, exist_ok=True)
     make_mixtures(args.out, MIXTURES, POOL)
-    logs: dict[str, list[str]] = {}
+    logs: dict[str, Path] = {}
     for seed in args.seeds:  # all mixtures with one seed before the next one: what there is can be compared
         for name in args.only:
             policy = train(args.out, name, seed, [f"--{o}" for o in args.train_option])
             folder = args.out / "results" / policy.name
             for start in ("recovery", "initial"):
                 log = evaluate("metaworld", SCENARIOS, "test", folder, f"--policy.path={policy}", start=start)
-            logs.setdefault(name, []).append(str(log))
-    roborecover(
-        "report", *(f"{n}={','.join(of)}" for n, of in logs.items()),
-        "--out", args.out / "report",
-    )  # fmt: skip
-    if len(args.seeds) > 1:
-        print(f"curve     {draw_curve(args.out / 'report')}")
+            logs[policy.name] = log
+    if args.store:
+        store_logs(logs, STORED)
+    report(logs, args.out)
 
 
 if __name__ == "__main__":

@@ -274,7 +274,8 @@ def test_continuing_reproduces_the_rest_of_the_trial(policies, logs, kind, tmp_p
     monkeypatch.setattr(run, "forks_of", own)
     found = forked(policies, logs, kind, tmp_path)
     assert len(found.rows) == 8
-    apart = {"options", "config_hash", *MEASURED}
+    of_the_run = {"run_scenarios", "run_trials", "shard"}
+    apart = {"options", "config_hash", *of_the_run, *MEASURED}
     for row in found.rows:
         logged = logs[kind][1][row.scenario_id].row
         assert {k: v for k, v in asdict(row).items() if k not in apart} == {

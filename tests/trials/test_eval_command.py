@@ -116,8 +116,11 @@ def test_a_rerun_repeats_nothing(run, whole):
     assert log.read_bytes() == full
 
 
-def test_shards_come_together(run, whole, tmp_path):
+def test_shards_come_together(run, whole, tmp_path, capsys):
     logs = [str(run(f"--shard={k}/2", out=f"s{k}") / "trials.jsonl") for k in range(2)]
+    assert "incomplete: 2 of 4 scenarios; shard 0/2 is missing" in capsys.readouterr().out
+    rows = [row for log in logs for row in read_trial_log(Path(log))]
+    assert {(r.run_scenarios, r.run_trials, r.shard) for r in rows} == {(4, 3, "0/2"), (4, 3, "1/2")}
     merged = tmp_path / "merged.jsonl"
     assert main(["merge", *logs, "--out", str(merged)]) == 0
     assert outcomes(read_trial_log(merged)) == whole

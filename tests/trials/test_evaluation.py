@@ -108,15 +108,15 @@ def test_a_training_loop_goes_on_as_if_nothing_had_been(dataset, trained):
 def test_a_policys_weights_are_its_name(trained):
     import torch
 
-    from lerobot_roborecover.env.identity import weights_identity
+    from lerobot_roborecover.env.identity import object_identity
 
     policy, _ = trained
-    before = weights_identity(policy)
-    assert before == weights_identity(policy)
+    before = object_identity(policy)
+    assert before == object_identity(policy)
     parameter = next(policy.parameters())
     with torch.no_grad():
         parameter.add_(1e-3)
-        assert weights_identity(policy) != before
+        assert object_identity(policy) != before
         parameter.sub_(1e-3)
 
 

@@ -27,7 +27,14 @@ def test_shards_make_the_whole(shards, tmp_path, capsys):
     out = tmp_path / "merged.jsonl"
     assert main(["merge", str(shards / "0.jsonl"), str(shards / "1.jsonl"), "--out", str(out)]) == 0
     assert "8 trials of 4 scenarios" in capsys.readouterr().out
-    assert outcomes(read_trial_log(out)) == outcomes(read_trial_log(shards / "whole.jsonl"))
+    rows = read_trial_log(out)
+    assert outcomes(rows) == outcomes(read_trial_log(shards / "whole.jsonl"))
+    assert {(r.run_scenarios, r.run_trials, r.shard) for r in rows} == {(4, 2, "0/2"), (4, 2, "1/2")}
+
+
+def test_a_shard_alone_says_what_is_missing(shards, tmp_path, capsys):
+    assert main(["merge", str(shards / "0.jsonl"), "--out", str(tmp_path / "m.jsonl")]) == 0
+    assert "incomplete: 2 of 4 scenarios; shard 1/2 is missing" in capsys.readouterr().err
 
 
 def test_overlapping_logs_keep_each_trial_once(shards, tmp_path):

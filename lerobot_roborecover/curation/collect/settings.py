@@ -10,6 +10,7 @@ from typing import Any
 
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.env.facts import RunFacts, facts_of
 from lerobot_roborecover.env.run import PlatformPart
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import write_whole
@@ -28,17 +29,27 @@ def driver_of(options: CollectOptions) -> str:
     return policy_identity(options.policy)
 
 
+def _policy_facts(options: CollectOptions) -> RunFacts | None:
+    """Who the policy is, by its files and options; None for an expert."""
+    if not options.policy:
+        return None
+    from lerobot_roborecover.trials.load import policy_config
+
+    config = policy_config(options.policy, options.policy_options, options.device)
+    return facts_of(config, rename_map=options.rename_map)
+
+
 def settings_of(
     options: CollectOptions, spec: PlatformPart, units: Sequence[Planned]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What decides the rollouts, and what decides the dataset."""
-    from lerobot_roborecover.env.identity import policy_identity
-
+    policy = _policy_facts(options)
     by_init_state = any(unit.reset.init_state_index is not None for unit in units)
     rolled = {
         "platform": options.platform,
         "driver": driver_of(options),
-        "policy": policy_identity(options.policy) if options.policy else "",
+        "policy": policy.policy if policy else "",
+        "policy settings": dict(policy.policy_settings) if policy else {},
         "expert": options.expert,
         "policy options": sorted(options.policy_options),
         "env": {

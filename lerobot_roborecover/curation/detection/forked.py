@@ -15,6 +15,7 @@ from lerobot_roborecover.curation.detection.trials import SeenTrial, TrialSource
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
+from lerobot_roborecover.env.policy_settings import digest_of
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
 from lerobot_roborecover.env.trial_log import read_trial_log
 from lerobot_roborecover.env.trial_row import TrialRow
@@ -85,6 +86,12 @@ def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
         raise MonitorError(
             f"--forks {log}: forks of {others[0]}, and the policy that is watched is {policy}. Fork its own "
             "trials"
+        )
+    settings = {digest_of(p.continued.policy_settings) for p in pairs}
+    if len(settings) > 1:
+        raise MonitorError(
+            f"--forks {log}: forks of {policy} under {len(settings)} settings of its own, which would be "
+            "mixed. Keep one in a log"
         )
     by_trial: dict[tuple, list[ForkPair]] = defaultdict(list)
     for p in pairs:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_roborecover.analysis.fork_gain import CONTINUE, FORK, MATCHED
+from lerobot_roborecover.analysis.labels import settings_differences
 from lerobot_roborecover.curation.forks.arms import ForkArm
 from lerobot_roborecover.curation.forks.parents import Choice, LoggedTrial, rows_of, usable, with_actions
 from lerobot_roborecover.curation.forks.trial import ANOTHER, OWN, Fork, ForkRun, LeadHost
@@ -106,13 +107,14 @@ def run_forks(
     from lerobot_roborecover.trials.load import policy_config
 
     base = policy_config(request.policy, request.policy_options, request.device)
-    rows, dropped = usable(rows_of(request.logs, facts_of(base).policy), request.choice)
+    facts = facts_of(base, rename_map=request.rename_map)
+    rows, dropped = usable(rows_of(request.logs, facts.policy), request.choice)
     if not rows:
         why = "; ".join(f"{n} {reason}" for reason, n in dropped.most_common())
         raise ScenarioError(f"no trial is left to be forked: {why}")
     env = _env(request, rows[0][1], sorted({row.scenario_id for _, row in rows}))
     env.trial_log, env.record_actions = str(request.out / TRIALS_FILE), True
-    scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts_of(base))
+    scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     run.pool.acquire()
     try:
         for _, row in rows:
@@ -149,11 +151,11 @@ def _run_arm(
     on_fork: Callable[[str, int, int], None],
 ) -> list[TrialRow]:
     config = arm.config(base, request.correction_steps)
-    facts = facts_of(config)
+    facts = facts_of(config, rename_map=request.rename_map)
     options = {**shared.protocol.options, **(facts.intervention.options() if facts.intervention else {})}
     protocol = replace(
         shared.protocol, policy=facts.policy, execution_horizon=facts.execution_horizon, options=options,
-        run_seed=parents[0].row.run_seed,
+        policy_settings=facts.policy_settings, run_seed=parents[0].row.run_seed,
     )  # fmt: skip
     forks = forks_of(parents, arm, request)
     of_run: dict[str, Any] = {f.name: getattr(shared, f.name) for f in fields(Run)}
@@ -224,6 +226,20 @@ def _check_same(run: Run, row: TrialRow) -> None:
             f"trial {row.trial} of {row.scenario_id} executed {row.execution_horizon} actions per inference, "
             f"the policy now {run.protocol.execution_horizon}: give --policy-option "
             f"n_action_steps={row.execution_horizon}"
+        )
+    if not row.first_state:
+        raise ScenarioError(
+            f"trial {row.trial} of {row.scenario_id} was written by an earlier version, which does not say "
+            "the policy's options: what it did may not be continued. Run it again, with "
+            "--env.record_actions=true"
+        )
+    settings = run.protocol.policy_settings
+    if row.policy_settings != settings:
+        differences = settings_differences(row.policy_settings, dict(settings))
+        raise ScenarioError(
+            f"trial {row.trial} of {row.scenario_id} was run with other settings of the policy than here "
+            f"(there / here: {differences}), which gives another trial. Fork it with --policy-option and "
+            "--rename-map as it was run"
         )
     here, there = dict(run.protocol.options), {k: v for k, v in row.options.items() if k not in _FREE}
     for kind, ours, theirs in (("option", here, there), ("version of", run.protocol.versions, row.versions)):

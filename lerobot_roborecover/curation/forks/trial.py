@@ -239,7 +239,15 @@ class ForkRun(Run):
         """The row of a continuation that is the rest of the logged trial, on disk with its actions, as it
         would be if the policy, which is deterministic, had run again."""
         protocol, log, row = fork.protocol(self.protocol), self.kept_log(), fork.parent.row
-        row = replace(row, options=dict(protocol.options), config_hash=protocol.config_hash())
+        extent = self.extent
+        row = replace(
+            row,
+            options=dict(protocol.options),
+            config_hash=protocol.config_hash(),
+            run_scenarios=extent.scenarios if extent else None,
+            run_trials=extent.trials if extent else None,
+            shard=extent.shard if extent else "",
+        )
         put_actions(log.path.with_name(ACTIONS_FOLDER), fork.parent.actions, row)
         log.append(row)
         return row

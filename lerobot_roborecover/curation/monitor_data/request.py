@@ -18,7 +18,9 @@ from lerobot_roborecover.curation.monitor_data.data import describe, write_monit
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, read_trials, run_trials
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.datasets.trajectories import read_trajectories
-from lerobot_roborecover.env.identity import policy_identity
+from lerobot_roborecover.env.facts import facts_of
+from lerobot_roborecover.env.policy_settings import digest_of
+from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 
@@ -115,10 +117,10 @@ def _continuations(
     kept: dict[str, dict[str, PolicyTrial]] = {}
     for folder in request.trials_from:
         for trial in _first_trials(folder, by_id, dropped):
-            kept.setdefault(trial.row.policy, {})[trial.row.scenario_id] = trial
+            kept.setdefault(_who(trial.row), {})[trial.row.scenario_id] = trial
     found = []
     for number, policy in enumerate(request.policies):
-        trials = kept.pop(policy_identity(policy), {}) if kept else {}
+        trials = kept.pop(_asked(policy, request.device), {}) if kept else {}
         missing = by_id.keys() - trials.keys()
         if missing:
             ran = run_trials(
@@ -137,6 +139,19 @@ def _continuations(
     for folder in request.rollouts:
         found += from_rollouts(read_trajectories(folder), by_id, dropped)
     return found
+
+
+def _who(row: TrialRow) -> str:
+    """A row's policy with its settings; the name alone where the row is of an earlier version."""
+    return row.policy if not row.first_state else f"{row.policy} {digest_of(row.policy_settings)}"
+
+
+def _asked(policy: str, device: str | None) -> str:
+    """The same of a checkpoint as it would be run here."""
+    from lerobot_roborecover.trials.load import policy_config
+
+    facts = facts_of(policy_config(policy, device=device))
+    return f"{facts.policy} {digest_of(facts.policy_settings)}"
 
 
 def _first_trials(folder: Path, scenarios: Mapping[str, Scenario], dropped: Counter) -> list[PolicyTrial]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.policy_trials import (
+    CURRENT_FILE,
     TRIALS_FILE,
     PolicyTrial,
     env_config,
@@ -61,9 +62,9 @@ class PolicySpec:
 
 def default_name(path: str) -> str:
     """A policy's name where none is given: its identity without the hash."""
-    from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.env.identity import policy_name
 
-    return policy_identity(path).split("@")[0].strip("/").replace("/", "--")[:64]
+    return policy_name(path).strip("/").replace("/", "--")[:64]
 
 
 def parse_policies(
@@ -149,7 +150,10 @@ def check_policies(policies: Sequence[PolicySpec]) -> None:
         raise OptionError("no policy: name the screening policies with --policy (the paper has four)")
     for key, what in (
         (lambda p: p.name, "have the name"),
-        (lambda p: (p.path, sorted(p.options), sorted(p.env)), "are the same checkpoint and options:"),
+        (
+            lambda p: (p.path, sorted(p.options), sorted(p.env), sorted(p.rename_map.items())),
+            "are the same checkpoint and options:",
+        ),
     ):
         seen: dict[Any, PolicySpec] = {}
         for policy in policies:
@@ -254,6 +258,8 @@ def take_trials(source: Path, target: Path) -> int:
     """
     theirs = source / POLICY_FILE
     target.mkdir(parents=True, exist_ok=True)
+    if (source / CURRENT_FILE).exists() and not (target / CURRENT_FILE).exists():
+        shutil.copyfile(source / CURRENT_FILE, target / CURRENT_FILE)
     if theirs.exists() and not (target / POLICY_FILE).exists():
         shutil.copyfile(theirs, target / POLICY_FILE)
     elif theirs.exists():

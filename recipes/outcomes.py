@@ -1,0 +1,47 @@
+"""Trial logs of finished experiments, kept with the code: every number of their pages can be computed again.
+
+A log of 359 trials takes about 60 kB compressed; every command that reads trial logs reads these as well.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Mapping
+from pathlib import Path
+
+from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.whole import new_folder
+
+OUTCOMES = Path(__file__).parent / "outcomes"
+_SUFFIX = ".jsonl.gz"
+
+
+def store_logs(logs: Mapping[str, Path], folder: Path) -> None:
+    """Writes compressed copies of trial logs in place of those that the folder holds.
+
+    The same logs give the same bytes.
+
+    Args:
+        logs: finished trial logs, by the name of their arm.
+        folder: of the experiment.
+
+    Raises:
+        TrialLogError: a log is damaged.
+    """
+    with new_folder(folder, replace=True) as made:
+        made.mkdir()
+        for name, log in logs.items():
+            read_trial_log(log)
+            (made / f"{name}{_SUFFIX}").write_bytes(gzip.compress(log.read_bytes(), mtime=0))
+
+
+def stored_logs(folder: Path) -> dict[str, Path]:
+    """Returns the stored trial logs of an experiment, by the name of their arm.
+
+    Raises:
+        FileNotFoundError: nothing is stored.
+    """
+    found = {path.name.removesuffix(_SUFFIX): path for path in sorted(folder.glob(f"*{_SUFFIX}"))}
+    if not found:
+        raise FileNotFoundError(f"{folder} holds no stored outcomes; run the experiment without --stored")
+    return found
