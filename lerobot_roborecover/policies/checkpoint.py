@@ -8,14 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.env.intervention_options import POLICY_TYPE
 from lerobot_roborecover.errors import OptionError
 
 CONFIG_FILE = "config.json"
 _STEP_FOLDER = "pretrained_model"
 _WEIGHTS = (".safetensors", ".bin", ".pt", ".pth", ".ckpt")
-_WITHOUT_WEIGHTS = ("remote", POLICY_TYPE)
-"""Policy types whose folder is a configuration alone."""
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _MAX_HEADER_BYTES = 10**8
 """Of the safetensors format."""
@@ -45,12 +42,9 @@ def check_folder(folder: Path, label: str) -> None:
     """Checks a checkpoint's folder: see `check_checkpoint`."""
     if not (folder / CONFIG_FILE).is_file():
         raise OptionError(f"{label}: the folder has no {CONFIG_FILE}. {_instead_of(folder)}")
-    config = read_config(folder / CONFIG_FILE, label)
-    files = sorted(p for p in folder.iterdir() if p.suffix in _WEIGHTS and p.is_file())
-    for file in files:
+    read_config(folder / CONFIG_FILE, label)
+    for file in sorted(p for p in folder.iterdir() if p.suffix in _WEIGHTS and p.is_file()):
         check_file(file, label)
-    if not files and config["type"] not in _WITHOUT_WEIGHTS:
-        raise OptionError(f"{label}: the folder has no weights (model.safetensors). Copy all of its files")
 
 
 def read_config(file: Path, label: str) -> dict[str, Any]:

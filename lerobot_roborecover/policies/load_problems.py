@@ -37,8 +37,8 @@ def load_remedy(err: Exception) -> str:
         return "install what it names: pip install 'lerobot_env_roborecover[policies]' has LeRobot's families"
     if kind & {"OutOfMemoryError", "MemoryError"}:
         return "free memory there, or take another --policy.device"
-    if isinstance(err, FileNotFoundError) and err.errno is not None:
-        return "the checkpoint is not whole: copy or download it again"
+    if isinstance(err, FileNotFoundError):
+        return "the checkpoint is not whole: copy or download all of its files again"
     return ""
 
 
