@@ -81,6 +81,7 @@ def run_trials(
 
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
+        ScenarioError: the policy went away or hung, so that trials were not run.
     """
     from lerobot_roborecover.trials import load
 
@@ -110,7 +111,9 @@ def run_trials(
                 count[0] += 1
                 on_row(row, count[0], len(units))
 
-            open_engine(run, todo, partial(load.load_host, spec), places, on_row=told).run(todo)
+            engine = open_engine(run, todo, partial(load.load_host, spec), places, on_row=told)
+            engine.run(todo)
+            engine.check_all_run()
         rows = {r.key(): r for r in log.rows}
     finally:
         run.pool.release()

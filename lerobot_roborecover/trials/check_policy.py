@@ -23,11 +23,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.env.action_checks import action_problem
 from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
-from lerobot_roborecover.env.trial import action_problem
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.host import Host, PolicyError
 from lerobot_roborecover.policies.policy_host import PolicyHost
