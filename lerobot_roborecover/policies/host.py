@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from lerobot_roborecover.env.action_checks import count_problem
 from lerobot_roborecover.env.policy_watch import hang_reason
 from lerobot_roborecover.policies.policy_thread import CallStoppedError, CallTimeoutError, PolicyThread
 
@@ -179,3 +180,58 @@ class InlineReplica:
         except CallTimeoutError:
             self.gone = hang_reason(self._limit_s)
             raise ReplicaHungError(self.gone) from None
+
+
+class WatchedHost:
+    """A host whose inferences the watchdog ends, for a caller that asks directly, without an engine.
+
+    Args:
+        host: the policy.
+        limit_s: longest that one inference may take.
+    """
+
+    def __init__(self, host: Host, limit_s: float):
+        self._host, self._thread = host, PolicyThread()
+        self._replica = InlineReplica(host, self._thread, limit_s)
+
+        self.batched = host.batched
+        self.horizon = getattr(host, "horizon", 1)
+
+    @property
+    def max_batch(self) -> int:
+        """As the policy's."""
+        return self._host.max_batch
+
+    def noise(self, seed: int | None) -> str:
+        """As the policy's."""
+        return self._host.noise(seed)
+
+    def start(self, seed: int | None) -> Any:
+        """As the policy's."""
+        return self._host.start(seed)
+
+    def finish(self, history: Any) -> None:
+        """As the policy's."""
+        self._host.finish(history)
+
+    def act(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        instructions: Sequence[str],
+        histories: Sequence[Any],
+    ) -> list[Chunk | PolicyError]:
+        """One answer per observation; an error for each where an inference has hung, now or before."""
+        if not self._replica.gone:
+            self._replica.ask(list(observations), list(instructions), list(histories))
+            try:
+                answers = self._replica.answer() or []
+            except ReplicaHungError:
+                pass
+            else:
+                problem = count_problem(len(answers), len(observations))
+                return [PolicyError(problem)] * len(observations) if problem else answers
+        return [PolicyError(self._replica.gone)] * len(observations)
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._thread.close()
