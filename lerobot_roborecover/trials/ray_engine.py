@@ -6,6 +6,7 @@ whose history was in a lost policy replica.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +23,7 @@ from lerobot_roborecover.policies.host import (
     ReplicaHungError,
     ReplicaLostError,
 )
+from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.trials.engine import Engine
 from lerobot_roborecover.workers.cluster import ActorGoneError, Cluster, RemotePart, wait_for_calls
 from lerobot_roborecover.workers.workplace import Opening, Workplace
@@ -167,7 +169,9 @@ def open_ray_engine(
     cluster.make_slots(opening)
     run.pool.configure(snapshot_dir=snapshot_dir)
     seats = run.pool.worker_slots(count if most is None else min(count, most))
-    policy = ray.remote(num_cpus=1, num_gpus=gpus)(PolicyActor)
+    # What decides how policies round here decides it there: torch reads these variables when it is loaded.
+    chosen = {name: os.environ[name] for name in KERNELS if name in os.environ}
+    policy = ray.remote(num_cpus=1, num_gpus=gpus, runtime_env={"env_vars": chosen})(PolicyActor)
 
     def put(again: bool) -> Any:
         # Where simulators have all CPUs that are left, they would wait for it for ever.
