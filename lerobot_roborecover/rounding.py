@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -30,6 +31,20 @@ policies round alike. They are read when torch is loaded: given to a process, no
 def policy_kernels() -> dict[str, str]:
     """`KERNELS`, or no more than one thread on a processor that lacks them."""
     return dict(KERNELS) if has_kernels() else {"OMP_NUM_THREADS": KERNELS["OMP_NUM_THREADS"]}
+
+
+def pin_policy_kernels() -> bool:
+    """Chooses `policy_kernels` for this process and its children, except what the user has chosen.
+
+    Returns:
+        Whether the choice takes effect: torch reads the variables when it is loaded, so that nothing is
+        chosen where it has been.
+    """
+    if "torch" in sys.modules:
+        return False
+    for name, value in policy_kernels().items():
+        os.environ.setdefault(name, value)
+    return True
 
 
 def pin_rounding() -> None:

@@ -73,3 +73,24 @@ def test_square_roots_in_float64_round_to_the_float32_that_is_right():
         "print(int((roots != np.sqrt(x)).sum()))"
     )
     assert core_type(code, **KERNELS) == "0"
+
+
+@pytest.mark.parametrize(
+    "words", [["build", "missing.yaml"], ["screen", "missing", "--policy", "missing", "--out", "out"]]
+)
+def test_commands_whose_outcomes_are_stored_choose_a_policys_kernels(words, tmp_path):
+    """Before torch is loaded; what the user has chosen stays."""
+    program = (
+        "import os, sys\n"
+        "from lerobot_roborecover.cli.main import main\n"
+        "from lerobot_roborecover.rounding import KERNELS\n"
+        "status = main(sys.argv[1:])\n"
+        "print(status, *(os.environ.get(name, '-') for name in KERNELS))"
+    )
+    env = {k: v for k, v in os.environ.items() if k not in KERNELS} | {"OMP_NUM_THREADS": "3"}
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        capture_output=True, text=True, env=env, cwd=tmp_path, check=True,
+    )  # fmt: skip
+    chosen = {**policy_kernels(), "OMP_NUM_THREADS": "3"}
+    assert done.stdout.split() == ["2", *(chosen.get(name, "-") for name in KERNELS)]

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.rounding import pin_policy_kernels
+
 HELP = (
     "Build a scenario dataset from one YAML file: collect, annotate, agree, screen, validate, split, render."
 )
@@ -26,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Builds, writes the summary, and prints the funnel."""
+    pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     from lerobot_roborecover.curation.pipeline.check import check_build
     from lerobot_roborecover.curation.pipeline.config import read_config
     from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting

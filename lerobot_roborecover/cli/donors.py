@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.rounding import pin_policy_kernels
 
 HELP = (
     "Make the dataset that Correction is trained on: other policies' recoveries of training scenarios that "
@@ -64,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Chooses, runs, judges, writes; prints the funnel."""
+    pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     import json
 
     from lerobot_roborecover.analysis.labels import tell_settings_apart

@@ -84,7 +84,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 done; 1 done but something is wrong; 2 refused; others as `guarded`.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        from lerobot_roborecover.policies import policy_thread
+
+        policy_thread.own_process()
+        status = main(sys.argv[1:])
+        policy_thread.exit_process(status)
+        return status
+    argv = list(argv)
     command = argv[0] if argv else ""
     quiet(command)
     return guarded(f"roborecover {command}", lambda: _run(command, argv))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
+from lerobot_roborecover.rounding import pin_policy_kernels
 
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.screen.dataset import ScreenRequest
@@ -60,7 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--device", help="of the policies")
     add("--slots", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
     add_workplace(parser, policies=True)
-    add("--max-batch", type=int, default=64, help="observations per inference, at most (%(default)s)")
+    add(
+        "--max-batch", type=int, default=1,
+        help="observations per inference, at most (%(default)s); above 1 the last bits of actions, and with "
+        "them some outcomes, depend on the other observations",
+    )  # fmt: skip
     add(
         "--env", action="append", default=[], metavar="[NAME:]KEY=VALUE",
         help="option of the recovery env type, for one policy where its name stands before it; may be given "
@@ -78,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Screens, and prints the tables and the funnel."""
+    pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     from lerobot_roborecover.curation.screen.dataset import describe, screen_dataset
     from lerobot_roborecover.progress import Progress
 

@@ -56,7 +56,7 @@ def run_trials(
     seed: int = 1000,
     device: str | None = None,
     slots: int = 0,
-    max_batch: int = 64,
+    max_batch: int = 1,
     workplace: Workplace = HERE,
     replicas: int = 0,
     policy_options: Sequence[str] = (),
@@ -74,7 +74,8 @@ def run_trials(
         seed: of the run.
         device: of the policy; None takes what its config says.
         slots: simulators at work at once; 0 takes as many as there is room for.
-        max_batch: observations per inference, at most.
+        max_batch: observations per inference, at most. Above 1 the last bits of an action depend on the
+            other observations of its inference, and so may the outcome.
         workplace: where simulators and policy are.
         replicas: copies of the policy on a cluster, see `EnginePlaces`.
         policy_options: `--name=value` options of the policy's config.
@@ -86,6 +87,7 @@ def run_trials(
 
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
+        ScenarioError: the policy went away or hung, so that trials were not run.
     """
     from lerobot_roborecover.trials import load
 
@@ -104,7 +106,7 @@ def run_trials(
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
-            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch)
+            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch, portable=True)
             places = EnginePlaces(
                 workplace, slots, replicas, str(config.device), env.obs_type != "state",
                 snapshot_dir=env.snapshot_dir or None,
@@ -116,7 +118,9 @@ def run_trials(
                 count[0] += 1
                 on_row(row, count[0], len(units))
 
-            open_engine(run, todo, partial(load.load_host, spec), places, on_row=told).run(todo)
+            engine = open_engine(run, todo, partial(load.load_host, spec), places, on_row=told)
+            engine.run(todo)
+            engine.check_all_run()
         rows = {r.key(): r for r in log.rows}
     finally:
         run.pool.release()

@@ -77,11 +77,17 @@ def split(rows: np.ndarray, width: int) -> tuple[np.ndarray, list[Directive] | N
         width: A.
 
     Returns:
-        (n, A) actions, and n directives; None where the policy gives none.
+        (n, A) actions, and n directives; None, and the rows as they are, where they carry none that can be
+        read: their width is then wrong.
     """
-    if rows.shape[-1] != width + WIDTH or not np.all(rows[:, width] == SIGNATURE):
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind != "f":
         return rows, None
-    return rows[:, :width], [_read(row) for row in rows[:, width:].astype(np.float64)]
+    if rows.shape[1] != width + WIDTH or not np.all(rows[:, width] == SIGNATURE):
+        return rows, None
+    try:
+        return rows[:, :width], [_read(row) for row in rows[:, width:].astype(np.float64)]
+    except (ValueError, OverflowError):  # no whole number of steps, or no controller
+        return rows, None
 
 
 def _read(columns: np.ndarray) -> Directive:

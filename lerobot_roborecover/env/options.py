@@ -14,6 +14,8 @@ from lerobot_roborecover.scenario import Start
 __all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
 
 GROUPS = ("suite", "cell", "source")
+POLICY_WATCHDOG_S = 1800.0
+"""Compiling a policy for the CPU takes minutes, and so does a batch of 64 for a large one."""
 
 
 @dataclass
@@ -48,6 +50,9 @@ class RecoveryOptions:
     """Compare every handoff with the recorded one; beyond 2 mm the trial is a `state_mismatch`."""
     watchdog_s: float = 300.0
     """Longest a simulator may take over one command before its worker is replaced, seconds."""
+    policy_watchdog_s: float = POLICY_WATCHDOG_S
+    """Longest the policy may take over one inference before its trials end as `policy_error`, seconds; a
+    first inference that compiles included. 0 waits for ever."""
     snapshot_dir: str = ""
     """Folder that keeps handoff snapshots between runs; empty shares them within the run alone."""
     record_actions: bool = False
@@ -77,6 +82,10 @@ class RecoveryOptions:
             raise OptionError(f"--env.rewind_steps={self.rewind_steps}: a step count from 0 to 100000")
         if not 0 < self.watchdog_s < 86_400:
             raise OptionError(f"--env.watchdog_s={self.watchdog_s}: seconds, above 0 and below a day")
+        if not 0 <= self.policy_watchdog_s < 86_400:
+            raise OptionError(
+                f"--env.policy_watchdog_s={self.policy_watchdog_s}: seconds below a day; 0 waits for ever"
+            )
         if self.meanwhile not in MEANWHILE:
             raise OptionError(f"--env.meanwhile={self.meanwhile}: not one of {list(MEANWHILE)}")
         if self.latency_s is not None and not 0 <= self.latency_s <= 600:

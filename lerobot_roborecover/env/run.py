@@ -17,7 +17,7 @@ from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.datasets.load import validate_for
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.intervention_options import InterventionFacts
-from lerobot_roborecover.env.options import OptionError, RecoveryOptions
+from lerobot_roborecover.env.options import POLICY_WATCHDOG_S, OptionError, RecoveryOptions
 from lerobot_roborecover.env.real_time import RealTime
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions
@@ -74,6 +74,8 @@ class Run:
     """Of a composite policy."""
     real_time: RealTime | None = None
     """None where the simulator waits for the policy."""
+    policy_watchdog_s: float = POLICY_WATCHDOG_S
+    """Longest that one inference may take; infinite where it may take for ever."""
     keep: Callable[[Trial, TrialRow], None] = lambda trial, row: None
     """Told of a trial that is over before its row is in the log: what it keeps is there for every row."""
 
@@ -233,6 +235,7 @@ def open_run(
         picture=spec.picture,
         intervention=facts.intervention,
         real_time=real_time,
+        policy_watchdog_s=options.policy_watchdog_s or float("inf"),
     )
     if options.record_actions:
         run.keep = partial(keep_actions, log.path.with_name(ACTIONS_FOLDER))

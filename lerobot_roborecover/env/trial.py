@@ -27,6 +27,7 @@ from typing import Protocol as Interface
 
 import numpy as np
 
+from lerobot_roborecover.env.action_checks import action_problem, chunk_problem
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.intervention_record import InterventionRecord
 from lerobot_roborecover.env.real_time import MovingClock, RealTime
@@ -211,6 +212,10 @@ class Trial:
         """
         self._leave(TrialState.ASKED, to=TrialState.ACTING)
         self._policy_s += seconds
+        problem = chunk_problem(self.scenario, actions, self._action_width)
+        if problem:
+            self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {problem}")
+            return None
         if self._clock is not None:
             actions = self._clock.sequence(actions, seconds)
         self._sent, self._directives = actions, directives or ()
@@ -397,15 +402,3 @@ def actions_digest(actions: Iterable[np.ndarray]) -> str:
 def percent(share: float) -> int:
     """Progress as rows have it: whole per cent, and 100 for nothing less than all."""
     return 100 if share >= 1.0 else min(max(round(100 * share), 0), 99)
-
-
-def action_problem(scenario: TrialStart, action: np.ndarray, width: int) -> str:
-    """Why an action cannot be sent to the scenario's simulator, in words; empty if it can."""
-    if action.shape != (width,):
-        return (
-            f"the policy gave an action of shape {action.shape}; platform {scenario.platform} takes "
-            f"({width},). Check that the checkpoint was trained for this platform"
-        )
-    if not np.isfinite(action).all():
-        return f"the policy gave a non-finite action {action.tolist()}; it was not sent to the simulator"
-    return ""

@@ -25,9 +25,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
+from lerobot_roborecover.env.action_checks import count_problem
 from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.facts import RunFacts
 from lerobot_roborecover.env.options import OptionError, RecoveryOptions
+from lerobot_roborecover.env.policy_watch import PolicyWatch
 from lerobot_roborecover.env.run import PlatformPart, Run, open_run, scenario_group
 from lerobot_roborecover.env.trial import Act, Trial, TrialState
 from lerobot_roborecover.env.trial_row import Protocol, trial_seed
@@ -44,6 +46,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         scenario: what every sub-environment rebuilds.
         num_envs: trials in a batch.
         run: slots, trial log and protocol, shared with the other scenarios.
+        watch: of the policy, shared too; None where nothing watches it.
     """
 
     metadata = {  # noqa: RUF012 - Gymnasium's, and no ClassVar
@@ -51,10 +54,11 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         "autoreset_mode": gym.vector.AutoresetMode.DISABLED,
     }
 
-    def __init__(self, scenario: Scenario, num_envs: int, run: Run):
+    def __init__(self, scenario: Scenario, num_envs: int, run: Run, watch: PolicyWatch | None = None):
         self.scenario = scenario
         self.num_envs = num_envs
         self.run = run
+        self._watch = watch
         self.render_mode = "rgb_array"
         self.metadata = {**self.metadata, "render_fps": 20}
         self._trials: list[Trial] = []
@@ -96,6 +100,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
             seed: LeRobot's seeds, one a trial: run seed + trial index. Only the run seed is read from them.
             options: not used.
         """
+        self._stop_watch()
         first = self._next_trial
         self._next_trial += self.num_envs
         self._protocol = self._with_run_seed(seed, first)
@@ -115,6 +120,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
             self._record_if_over(trial)
         self._seed_policy_noise(first)
         self._replied = time.perf_counter()
+        self._start_watch()
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -123,13 +129,19 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         Args:
             actions: (num_envs, action width), or as many columns more as `directives.WIDTH`.
         """
+        self._stop_watch()
         waited = time.perf_counter() - self._replied
         slots = self.run.pool.slots(self.num_envs)
         before = np.array([t.over for t in self._trials])
         actions, directives = split(np.asarray(actions), self.run.action_width(self.scenario))
+        miscounted = count_problem(len(actions) if actions.ndim else 0, self.num_envs)
         working = []
         for index, trial in enumerate(self._trials):
             if trial.over:
+                continue
+            if miscounted:
+                trial.refused(miscounted, seconds=waited)
+                self._record_if_over(trial)
                 continue
             own = directives and directives[index : index + 1]
             move = trial.decide(actions[index : index + 1], own, seconds=waited)
@@ -151,6 +163,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         done = np.array([t.over for t in self._trials])
         reward = np.where(before, 0.0, success.astype(np.float64))
         self._replied = time.perf_counter()
+        self._start_watch()
         return self._observation(), reward, done & success, done & ~success, {"is_success": success}
 
     # --- LeRobot's other questions
@@ -179,9 +192,26 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Gives the slots back; the run's last scenario to do so ends the workers."""
+        self._stop_watch()
         self.run.pool.release()
 
     # --- inside
+
+    def _start_watch(self) -> None:
+        if self._watch is not None and not all(t.over for t in self._trials):
+            self._watch.begin(self._hung)
+
+    def _stop_watch(self) -> None:
+        if self._watch is not None:
+            self._watch.end()
+
+    def _hung(self, reason: str) -> None:
+        """Ends the trials that the policy has been asked about."""
+        waited = time.perf_counter() - self._replied
+        for trial in self._trials:
+            if trial.state is TrialState.ASKED:
+                trial.refused(reason, seconds=waited)
+                self._record_if_over(trial)
 
     def _with_run_seed(self, seed: int | list[int] | None, first: int) -> Protocol:
         if seed is None:
@@ -277,9 +307,14 @@ def create_recovery_envs(
             "while the policy thinks. Use roborecover eval, or --env.meanwhile=hold"
         )
     scenarios, run = open_run(options, spec, workers=workers, facts=facts)
+    watch = None
+    if facts is not None and facts.n_episodes is not None and run.policy_watchdog_s < float("inf"):
+        # LeRobot's own evaluation; in anyone else's loop, a long pause may be meant.
+        watch = PolicyWatch(run.policy_watchdog_s, str(run.kept_log().path))
+        run.pool.on_close(watch.close)
     envs: dict[str, dict[str, ScenarioVectorEnv]] = {}
     for scenario in sorted(scenarios, key=lambda s: (s.task.suite, s.task.name, s.id)):
         envs.setdefault(scenario_group(scenario, options.group_by), {})[scenario.id] = ScenarioVectorEnv(
-            scenario, n_envs, run
+            scenario, n_envs, run, watch
         )
     return envs

@@ -26,6 +26,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
+from lerobot_roborecover.env.action_checks import tensor_problem
 from lerobot_roborecover.policies.host import Chunk, PolicyError, Processor
 
 logger = logging.getLogger(__name__)
@@ -94,6 +95,8 @@ class PolicyHost:
         self._noise = STATELESS.get(kind, "inside")
         if self._noise == "fixed" and self._config.inference_seed is None:
             self._noise = "inside"
+        declared = (getattr(self._config, "output_features", None) or {}).get(ACTION)
+        self._width = None if declared is None else int(declared.shape[0])
         self._device = next(policy.parameters()).device
         self._amp = bool(getattr(self._config, "use_amp", False))
         self._idle: list[PreTrainedPolicy] = []
@@ -188,6 +191,8 @@ class PolicyHost:
         """Halves a batch that raises until it is known whose observation did it, or until it fits."""
         try:
             return self._predict(observations, instructions, noise)
+        except PolicyError as err:  # the same for every observation, whatever the batch
+            return [err] * len(observations)
         except torch.cuda.OutOfMemoryError as err:
             torch.cuda.empty_cache()
             if len(observations) > 1:
@@ -217,7 +222,9 @@ class PolicyHost:
         with self._no_grad(), torch.autocast(self._device.type, enabled=self._amp):
             self._policy.reset()
             extra = {} if noise is None else {"noise": noise}
-            chunk = self._policy.predict_action_chunk(batch, **extra)[:, : self.horizon]
+            chunk = self._policy.predict_action_chunk(batch, **extra)
+            self._check(tensor_problem(chunk, len(observations), 3, self._width))
+            chunk = chunk[:, : self.horizon]
             steps = [self._actions(chunk[:, i]) for i in range(chunk.shape[1])]
         return list(np.stack(steps, axis=1))
 
@@ -230,7 +237,11 @@ class PolicyHost:
             batch = self._prepare([observation], [instruction])
             autocast = torch.autocast(self._device.type, enabled=self._amp)
             with self._stream(history), self._no_grad(), autocast:
-                return self._actions(policy.select_action(batch))
+                action = policy.select_action(batch)
+                self._check(tensor_problem(action, 1, 2, self._width))
+                return self._actions(action)
+        except PolicyError as err:
+            return err
         except Exception as err:  # a policy may raise anything, and it costs its trial alone
             logger.warning("the policy raised", exc_info=True)
             return PolicyError(f"{type(err).__name__}: {err}")
@@ -258,8 +269,17 @@ class PolicyHost:
     ) -> dict[str, Any]:
         return self._pre(self.env_batch(observations, instructions))
 
+    @staticmethod
+    def _check(problem: str) -> None:
+        if problem:
+            raise PolicyError(problem)
+
     def _actions(self, action: torch.Tensor) -> np.ndarray:
-        action = self._env_post({ACTION: self._post(action)})[ACTION].to("cpu")
+        """(B, A) of a step, through the postprocessors."""
+        batch = len(action)
+        action = self._env_post({ACTION: self._post(action)})[ACTION]
+        self._check(tensor_problem(action, batch, 2, None))
+        action = action.to("cpu")
         # What a processor computes under `use_amp`, which NumPy has no type for.
         return (action.float() if action.dtype is torch.bfloat16 else action).numpy()
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from lerobot_roborecover.env.action_checks import type_problem
 from lerobot_roborecover.remote.errors import MappingError, WireError
 from lerobot_roborecover.remote.mapping import ImageEntry, Mapping, StateEntry
 
@@ -156,6 +157,8 @@ def _rows(answer: Any, key: str) -> np.ndarray:
     rows = answer[key]
     if not isinstance(rows, np.ndarray):
         raise WireError(f"the server's {key!r} is a {type(rows).__name__}, not an array")
+    if problem := type_problem(rows):
+        raise WireError(f"the server's {key!r}: {problem}")
     if rows.ndim == 3 and len(rows) == 1:
         rows = rows[0]
     if rows.ndim != 2 or not 1 <= len(rows) <= _MAX_ROWS or not 1 <= rows.shape[1] <= 1000:

@@ -21,13 +21,13 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.env.action_checks import action_problem, chunk_problem
 from lerobot_roborecover.env.command_line import run_with_arguments
 from lerobot_roborecover.env.facts import facts_of
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
-from lerobot_roborecover.env.trial import action_problem
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.policies.host import Host, PolicyError
+from lerobot_roborecover.policies.host import Host, PolicyError, WatchedHost
 from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.policy_host import PolicyHost
 from lerobot_roborecover.scenario import Scenario
@@ -122,6 +122,8 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
             host = load_host(host_spec(cfg))
         except Exception as err:  # a checkpoint may fail to load in any way
             return [_not_loaded(err), *findings]
+        watched = WatchedHost(host, run.policy_watchdog_s)
+        run.pool.on_close(watched.close)
         findings.insert(0, ok("loads", f"{config.type} on {config.device}"))
         own = host if isinstance(host, PolicyHost) else None  # a composite or remote policy has no such parts
         if own is not None:
@@ -137,14 +139,14 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
             return [*findings, start]
         if own is not None:
             findings += _look(cfg, own, run, scenarios, scenario, start)
-        steps = _take_steps(cfg, host, run, scenario, start)
+        steps = _take_steps(cfg, watched, run, scenario, start)
         if isinstance(steps, Finding):
             return [*findings, steps]
         findings.append(numbers.check_executed(steps.actions, run.pool.config.platform))
         if own is not None:
             findings.append(_check_states(own, scenario, steps, run.pool.config.platform))
-        findings.append(_check_trials(cfg, host, scenario, steps.observations[0]))
-        findings += _estimate(cfg, host, scenarios, scenario, steps)
+        findings.append(_check_trials(cfg, watched, scenario, steps.observations[0]))
+        findings += _estimate(cfg, watched, scenarios, scenario, steps)
         return findings
     finally:
         run.pool.release()
@@ -217,14 +219,11 @@ def _take_steps(
                     "actions", str(chunk), "a chunk of actions",
                     "the policy cannot take what the env gives: see the inputs above, and the message",
                 )  # fmt: skip
-            for action in np.atleast_2d(chunk)[: cfg.check.steps - len(actions)]:
-                problem = action_problem(scenario, action, width)
-                if problem:
-                    return failure(
-                        "actions", problem, f"{width} finite values",
-                        "such an action is never sent to the simulator; every trial would be a policy_error. "
-                        "Check the checkpoint's statistics and that it is for this robot",
-                    )  # fmt: skip
+            if problem := chunk_problem(scenario, chunk, width):
+                return _refused(problem, width)
+            for action in chunk[: cfg.check.steps - len(actions)]:
+                if problem := action_problem(scenario, action, width):
+                    return _refused(problem, width)
                 slot.send("act", action[None])
                 reply = slot.receive()
                 if isinstance(reply, SlotFailure):
@@ -248,6 +247,14 @@ def _take_steps(
         host.finish(history)
     step = statistics.median(step_s)
     return FirstSteps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
+
+
+def _refused(problem: str, width: int) -> Finding:
+    return failure(
+        "actions", problem, f"{width} finite values",
+        "such an action is never sent to the simulator; every trial would be a policy_error. Check the "
+        "checkpoint's statistics and that it is for this robot",
+    )  # fmt: skip
 
 
 def _look(

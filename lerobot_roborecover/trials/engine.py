@@ -15,16 +15,24 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+from lerobot_roborecover.env.action_checks import count_problem
 from lerobot_roborecover.env.directives import split
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.env.trial_row import TrialRow
-from lerobot_roborecover.policies.host import PolicyAwayError, PolicyError, Replica, ReplicaLostError
-from lerobot_roborecover.scenario import Outcome, Scenario, TrialStart
+from lerobot_roborecover.policies.host import (
+    PolicyAwayError,
+    PolicyError,
+    Replica,
+    ReplicaHungError,
+    ReplicaLostError,
+)
+from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, TrialStart
 from lerobot_roborecover.trials.company import Company
 from lerobot_roborecover.trials.seat import EngineSlot, Seat, Sitting
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
+from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackResult, SlotFailure
 from lerobot_roborecover.workers.slots import MOST_LOSSES
 
@@ -79,9 +87,11 @@ class Engine:
         self._queue = UnitQueue(())
         self._finished = 0
         self.reruns = 0
-        """Trials that were begun again because a machine was lost, or the way to the policy."""
+        """Trials that were begun again because a machine was lost, or the policy, or the way to it."""
+        self._stop: Callable[[], bool] = lambda: False
         self.unrun: dict[tuple[str, int], str] = {}
-        """Why trials were left for another run, by scenario and trial: the policy could not be reached."""
+        """Why trials were left for another run, by scenario and trial: the policy could not be reached, or an
+        inference never ended."""
 
     def run(self, units: Sequence[Unit[TrialStart]], stop: Callable[[], bool] = lambda: False) -> int:
         """Runs all units that the log does not hold yet.
@@ -94,7 +104,7 @@ class Engine:
             Number of trials finished.
         """
         self._queue = self._queue_of(unfinished(self._run, units))
-        self._finished = 0
+        self._finished, self._stop = 0, stop
         while not stop():
             self._fill()
             events = self._events()
@@ -107,7 +117,25 @@ class Engine:
         for sitting in self._sittings():
             if sitting.recording is not None:
                 sitting.recording.drop()
+        reasons = [r.gone for r in self._replicas if r.gone]
+        if len(reasons) == len(self._replicas) and not stop():
+            while (unit := self._queue.take(None)) is not None:
+                self.unrun[unit.scenario.id, unit.trial] = reasons[0]
         return self._finished
+
+    def check_all_run(self) -> None:
+        """Checks that no trial was left for another run.
+
+        Raises:
+            ScenarioError: some were; the same command goes on.
+        """
+        if self.unrun:
+            (scenario, trial), reason = next(iter(self.unrun.items()))
+            raise ScenarioError(
+                f"{counted(len(self.unrun), 'trial')} could not be run: the policy was away or hung (trial "
+                f"{trial} of {scenario}: {reason}). What has finished is kept: once the policy answers, run "
+                "the same command again"
+            )
 
     def _sittings(self) -> list[Sitting]:
         """The trials under way, in the order of their seats."""
@@ -133,7 +161,8 @@ class Engine:
 
     def _least_busy(self) -> Replica | None:
         users = [s.replica for s in self._sittings()]
-        return min((r for r in self._replicas if not r.opening), key=users.count, default=None)
+        able = (r for r in self._replicas if not (r.opening or r.gone))
+        return min(able, key=users.count, default=None)
 
     def _start(self, seat: Seat, unit: Unit[TrialStart], replica: Replica) -> None:
         trial = self._run.trial(unit.scenario, unit.trial)
@@ -217,16 +246,25 @@ class Engine:
     def _answered(self, replica: Replica) -> None:
         asked, began = self._asked.pop(replica)
         try:
-            chunks = replica.answer()
+            answers = replica.answer(self._stop)
         except ReplicaLostError as err:
+            if isinstance(err, ReplicaHungError):
+                for sitting in asked:
+                    sitting.trial.refused(err, seconds=self._clock() - began)
+                    sitting.replica = None
+                    self._finish(sitting)
             for sitting in self._sittings_of(replica):
                 sitting.replica = None
                 if not sitting.working:  # one that works is given up when its slot has replied
                     self._lost(sitting, str(err))
             return
+        if answers is None:
+            return
+        if problem := count_problem(len(answers), len(asked)):
+            answers = [PolicyError(problem)] * len(asked)
         seconds = self._clock() - began
         self._company[replica].inferred(len(asked), seconds)
-        for sitting, chunk in zip(asked, chunks, strict=True):
+        for sitting, chunk in zip(asked, answers, strict=True):
             trial, slot = sitting.trial, sitting.seat.slot
             if isinstance(chunk, PolicyAwayError):
                 self._away(sitting, str(chunk))

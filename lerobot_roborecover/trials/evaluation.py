@@ -7,6 +7,7 @@ loop would change as well, the queue of actions that a policy keeps for itself, 
 
 from __future__ import annotations
 
+import logging
 import random
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -39,6 +40,9 @@ from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.load import HostSpec, load_host, load_processors, policy_config
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
+from lerobot_roborecover.words import counted
+
+logger = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -79,7 +83,8 @@ def evaluate(
         progress: show a line with trials, success so far and time left.
 
     Returns:
-        A row per trial, in the order of the scenarios; see `TrialRow` for its fields.
+        A row per trial, in the order of the scenarios; see `TrialRow` for its fields. Trials that could not
+        be run, because the policy could not be reached or hung, have none, and a warning says why.
 
     Raises:
         OptionError: an option, or the policy, cannot be used.
@@ -118,7 +123,13 @@ def evaluate(
                     slots=slots, device=str(config.device), draws=options.obs_type != "state"
                 )
                 make_host = partial(load_host, spec) if module is None else partial(_host, spec, module, *own)
-                open_engine(run, units, make_host, places, on_row=show).run(units)
+                engine = open_engine(run, units, make_host, places, on_row=show)
+                engine.run(units)
+                for (scenario, trial), reason in list(engine.unrun.items())[:1]:
+                    logger.warning(
+                        "%s could not be run, and have no row: trial %d of %s: %s",
+                        counted(len(engine.unrun), "trial"), trial, scenario, reason,
+                    )  # fmt: skip
             if line is not None:
                 line.show(tally, final=True)
             found = {(r.scenario_id, r.trial): r for r in run.rows()}

@@ -8,6 +8,7 @@ from typing import Any
 
 from lerobot_roborecover.env.run import Run
 from lerobot_roborecover.policies.host import Host, InlineReplica
+from lerobot_roborecover.policies.policy_thread import PolicyThread
 from lerobot_roborecover.trials.engine import Engine, unfinished
 from lerobot_roborecover.trials.smoke import check_smoke
 from lerobot_roborecover.trials.units import Unit, first_units
@@ -20,11 +21,18 @@ class LocalEngine(Engine):
         run: pool, protocol, trial log.
         host: the policy.
         slots: how many simulators.
+        thread: where the policy infers; None makes one.
         options: of `Engine`.
     """
 
-    def __init__(self, run: Run, host: Host, *, slots: int, **options: Any):
-        super().__init__(run, run.pool.worker_slots(slots), [InlineReplica(host)], wait, **options)
+    def __init__(
+        self, run: Run, host: Host, *, slots: int, thread: PolicyThread | None = None, **options: Any
+    ):
+        if thread is None:
+            thread = PolicyThread()
+            run.pool.on_close(thread.close)
+        replica = InlineReplica(host, thread, run.policy_watchdog_s)
+        super().__init__(run, run.pool.worker_slots(slots), [replica], wait, **options)
 
 
 def open_local_engine(
@@ -33,6 +41,8 @@ def open_local_engine(
     make_host: Callable[[], Host],
     slots: int,
     drawing: Mapping[str, str | None] | None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> LocalEngine:
     """Starts the simulators, has each make its first task and a picture while the policy loads, and puts both
@@ -44,9 +54,11 @@ def open_local_engine(
         make_host: loads the policy.
         slots: simulators at once, at most.
         drawing: environment variables that say where simulators draw; None where they draw nothing.
+        stop: asked while the policy loads; True gives up.
         options: of `Engine`.
 
     Raises:
+        CallStoppedError: `stop` came before the policy was loaded.
         SimulatorError: no simulator can be made.
     """
     if drawing is not None:
@@ -55,8 +67,10 @@ def open_local_engine(
     begun = list(zip(run.pool.slots(count), first_units(unfinished(run, units), count), strict=False))
     for slot, unit in begun:
         slot.send(*(("fingerprint",) if drawing is None else ("smoke", unit.scenario)))
-    host = make_host()
+    thread = PolicyThread()
+    run.pool.on_close(thread.close)
+    host = thread.call(make_host, stop=stop)
     # Where no simulator can be made the run is refused; where only some break, it is their trials' affair.
     replies = [slot.receive() for slot, _ in begun]
     check_smoke(replies[0])
-    return LocalEngine(run, host, slots=count, **options)
+    return LocalEngine(run, host, slots=count, thread=thread, **options)

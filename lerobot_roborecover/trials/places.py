@@ -39,7 +39,13 @@ class EnginePlaces:
 
 
 def open_engine(
-    run: Run, units: Sequence[Unit], make_host: Callable[[], Host], places: EnginePlaces, **options: Any
+    run: Run,
+    units: Sequence[Unit],
+    make_host: Callable[[], Host],
+    places: EnginePlaces,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
 ) -> Engine:
     """Starts simulators, each of which makes its simulator first, and a picture where it is to draw; and the
     policy, once or several times.
@@ -49,9 +55,11 @@ def open_engine(
         units: what will be run; not empty.
         make_host: loads the policy. For a cluster it must travel: a module's function, or a partial of one.
         places: where.
+        stop: asked while a policy loads on this machine; True gives up.
         options: of `Engine`.
 
     Raises:
+        CallStoppedError: `stop` came before the policy was loaded.
         OptionError: a cluster is not there, or lacks what is asked for.
         SimulatorError: no simulator can be made.
     """
@@ -61,7 +69,7 @@ def open_engine(
         if places.draws:
             drawing = render_environment(places.render_device, places.device, egl_devices())
         slots = places.slots or default_slots(places.device, usable_cores(), available_gb())
-        return open_local_engine(run, units, make_host, slots, drawing, **options)
+        return open_local_engine(run, units, make_host, slots, drawing, stop=stop, **options)
     from lerobot_roborecover.trials.ray_engine import open_ray_engine
 
     opening = Opening(first=("fingerprint", None), check=check_smoke)

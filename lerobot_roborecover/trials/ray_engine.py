@@ -6,14 +6,24 @@ whose history was in a lost policy replica.
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 from typing import Any
 
 import ray
 
 from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.env.policy_watch import hang_reason
 from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.policies.host import Chunk, Host, PolicyError, ReplicaLostError
+from lerobot_roborecover.policies.host import (
+    Chunk,
+    Host,
+    PolicyError,
+    ReplicaHungError,
+    ReplicaLostError,
+)
+from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.trials.engine import Engine
 from lerobot_roborecover.workers.cluster import ActorGoneError, Cluster, RemotePart, wait_for_calls
 from lerobot_roborecover.workers.workplace import Opening, Workplace
@@ -54,9 +64,13 @@ class RayReplica(RemotePart):
     Args:
         make: makes the actor; told whether it is made again.
         seed: the run's.
+        limit_s: the watchdog: longest that one inference may take before the actor is replaced.
     """
 
-    def __init__(self, make: Callable[[bool], Any], seed: int | None):
+    gone = ""
+
+    def __init__(self, make: Callable[[bool], Any], seed: int | None, limit_s: float = float("inf")):
+        self._limit_s = limit_s
         self.max_batch, self.batched, self._noise = 1, True, ""
         self._tokens = 0
         super().__init__(make, lambda actor: actor.facts.remote(seed))
@@ -86,13 +100,22 @@ class RayReplica(RemotePart):
     def ask(self, observations: list, instructions: list[str], histories: list) -> None:
         """Begins an inference."""
         self.ready = self._actor.act.remote(observations, instructions, histories)
+        self.deadline = time.monotonic() + self._limit_s
 
-    def answer(self) -> list[Chunk | PolicyError]:
+    def answer(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError]:
         """Its result.
 
+        Args:
+            stop: not asked: the engine calls when the result is there, or overdue.
+
         Raises:
+            ReplicaHungError: the inference has taken too long; another replica is opening.
             ReplicaLostError: the node is gone; another replica is opening.
         """
+        overdue, self.deadline = time.monotonic() >= self.deadline, float("inf")
+        if overdue and not wait_for_calls([self.ready], 0.0):
+            self._open_again()
+            raise ReplicaHungError(hang_reason(self._limit_s))
         try:
             chunks, self.max_batch = self._result()
         except ActorGoneError as err:
@@ -146,13 +169,15 @@ def open_ray_engine(
     cluster.make_slots(opening)
     run.pool.configure(snapshot_dir=snapshot_dir)
     seats = run.pool.worker_slots(count if most is None else min(count, most))
-    policy = ray.remote(num_cpus=1, num_gpus=gpus)(PolicyActor)
+    # What decides how policies round here decides it there: torch reads these variables when it is loaded.
+    chosen = {name: os.environ[name] for name in KERNELS if name in os.environ}
+    policy = ray.remote(num_cpus=1, num_gpus=gpus, runtime_env={"env_vars": chosen})(PolicyActor)
 
     def put(again: bool) -> Any:
         # Where simulators have all CPUs that are left, they would wait for it for ever.
         return (policy.options(num_cpus=0) if again else policy).remote(make_host)
 
-    parts = [RayReplica(put, run.protocol.run_seed) for _ in range(replicas)]
+    parts = [RayReplica(put, run.protocol.run_seed, run.policy_watchdog_s) for _ in range(replicas)]
     for part in parts:
         run.pool.on_close(part.close)
     return Engine(run, seats, parts, wait_for_calls, **options)

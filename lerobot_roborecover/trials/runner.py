@@ -6,6 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.policies.policy_thread import CallStoppedError
 from lerobot_roborecover.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import eval_info
@@ -249,9 +251,10 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
                 "queue_of": UnitQueue if watch is None else OrderedQueue,
             }  # fmt: skip
             make_host = partial(load_host, host_spec(cfg))
-            engine = open_engine(run, units, make_host, _places(cfg), **options)
-            engine.run(units, stopper)
-            unrun = engine.unrun
+            with suppress(CallStoppedError):  # the time was up before the policy was loaded
+                engine = open_engine(run, units, make_host, _places(cfg), stop=stopper, **options)
+                engine.run(units, stopper)
+                unrun = engine.unrun
         line.show(tally, final=True)
         if watch is not None:
             record = watch.record(log.path)
@@ -270,8 +273,8 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
         if unrun:
             (scenario, trial), reason = next(iter(unrun.items()))
             print(
-                f"{counted(len(unrun), 'trial')} could not be run, and left no row: the policy was away "
-                f"(trial {trial} of {scenario}: {reason}). Once it is back, run the same command with "
+                f"{counted(len(unrun), 'trial')} could not be run, and left no row: the policy was away or "
+                f"hung (trial {trial} of {scenario}: {reason}). To go on, run the same command with "
                 f"--env.trial_log={log.path} --output_dir={out}",
                 file=sys.stderr,
             )

@@ -383,8 +383,8 @@ def test_an_actions_width_is_the_runs_and_not_the_prefixs():
     """LingBot-VA gives 16 values on scenarios that were recorded with 14."""
     from types import SimpleNamespace
 
+    from lerobot_roborecover.env.action_checks import action_problem
     from lerobot_roborecover.env.run import Run
-    from lerobot_roborecover.env.trial import action_problem
 
     scenario = SimpleNamespace(platform="robotwin", prefix=np.zeros((3, 14)))
     for mode, width in (("joint", 14), ("ee", 16)):

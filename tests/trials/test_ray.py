@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 from collections import Counter
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -40,6 +44,24 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reference(dataset, tmp_path_factory):
     return outcomes(evaluate(dataset, tmp_path_factory.mktemp("r") / "log.jsonl", trials=TRIALS, batch=1))
+
+
+class BlocksOnce(PushHost):
+    """Blocks in one inference, the first process that gets there; says what rounding it was told to use."""
+
+    def __init__(self, flag: Path):
+        super().__init__()
+        self._flag = flag
+
+    def noise(self, seed):
+        return os.environ.get("MKL_CBWR", "")
+
+    def act(self, observations, instructions, histories):
+        answers = super().act(observations, instructions, histories)
+        if len(self.batches) == 5 and not self._flag.exists():
+            self._flag.write_text(str(len(observations)))
+            threading.Event().wait()
+        return answers
 
 
 def no_policy():
@@ -93,6 +115,21 @@ def test_a_policy_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
     rows, reruns = run_on(dataset, tmp_path / "log.jsonl", step_s=0.005, on_row=kill_once)
     assert outcomes(rows) == reference
     assert 1 <= reruns <= 3, "as many as there are simulators"
+
+
+def test_a_policy_that_blocks_is_replaced_and_the_run_goes_on(
+    cluster, dataset, reference, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("MKL_CBWR", "COMPATIBLE")
+    flag = tmp_path / "blocked"
+    rows, _ = run_on(
+        dataset, tmp_path / "log.jsonl", make_host=partial(BlocksOnce, flag), policy_watchdog_s=30.0
+    )
+    broken = {key: o for key, o in outcomes(rows).items() if o[0] == "policy_error"}
+    assert len(broken) == int(flag.read_text()) >= 1
+    assert all("did not answer within 30 s" in r.reason for r in rows if r.outcome == "policy_error")
+    assert {**reference, **broken} == outcomes(rows)
+    assert {r.noise for r in rows} == {"COMPATIBLE"}, "the replicas round as this process does"
 
 
 def test_a_simulator_that_cannot_draw_ends_the_run_before_its_first_trial(cluster, dataset, tmp_path):

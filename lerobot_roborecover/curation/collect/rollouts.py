@@ -17,7 +17,6 @@ from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.trials.units import Unit, UnitQueue
 from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.dispatch import each
 from lerobot_roborecover.workers.messages import SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool
@@ -165,9 +164,4 @@ def run_policy(
         run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
         engine = open_engine(run, units, make_host, places)
         engine.run(units)
-        if engine.unrun:
-            (name, _), reason = next(iter(engine.unrun.items()))
-            raise ScenarioError(
-                f"{counted(len(engine.unrun), 'rollout')} could not be run: the policy was away ({name}: "
-                f"{reason}). What has ended is kept: once the policy is back, run the same command again"
-            )
+        engine.check_all_run()

@@ -178,7 +178,9 @@ def _run_arm(
     if todo:
         places = EnginePlaces(slots=request.slots, device=str(config.device), draws=env.obs_type != "state")
         make_host = partial(_host, request, env, config, arm)
-        open_engine(run, todo, make_host, places, on_row=told).run(todo)
+        engine = open_engine(run, todo, make_host, places, on_row=told)
+        engine.run(todo)
+        engine.check_all_run()
     keys = set(run.keys([(u.scenario, u.trial) for u in units]))
     return [row for row in run.kept_log().rows if row.key() in keys]
 

@@ -66,7 +66,8 @@ class ScreenRequest:
     """Invalid outcomes whose trials run again."""
     device: str | None = None
     slots: int = 0
-    max_batch: int = 64
+    max_batch: int = 1
+    """Observations per inference, at most; above 1 outcomes depend on who shares a batch."""
     workplace: Workplace = HERE
     """Where trials are run."""
     replicas: int = 0

@@ -178,7 +178,7 @@ def run_policy(
     shard: str = "",
     device: str | None = None,
     slots: int = 0,
-    max_batch: int = 64,
+    max_batch: int = 1,
     workplace: Workplace = HERE,
     replicas: int = 0,
     snapshots: Path | None = None,
