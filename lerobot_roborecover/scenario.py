@@ -416,6 +416,15 @@ class TrialStart:
         split)."""
         return self.rollout.sha256()
 
+    def first_state_sha256(self) -> str:
+        """Hash of everything that decides where an initial-state trial starts: task, reset and settling
+        actions. Scenarios that branch off from one first state share it."""
+        return self._first_state_sha256
+
+    @cached_property
+    def _first_state_sha256(self) -> str:
+        return Rollout(self.task, self.reset, self.prefix[: self.reset.settle_steps]).sha256()
+
 
 @dataclass(frozen=True)
 class Scenario(TrialStart):

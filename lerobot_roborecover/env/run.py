@@ -23,7 +23,7 @@ from lerobot_roborecover.env.real_time import RealTime
 from lerobot_roborecover.env.trial import Trial
 from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions
 from lerobot_roborecover.env.trial_log import RowLog, TrialLog, check_retry
-from lerobot_roborecover.env.trial_row import Protocol, TrialRow, trial_key
+from lerobot_roborecover.env.trial_row import Protocol, RunExtent, TrialRow, trial_key
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.robot_fingerprint import (
     NAME,
@@ -65,8 +65,8 @@ class Run:
     dataset: str
     dataset_revision: str | None
     handoff_check: bool = True
-    n_trials: int | None = None
-    """Trials asked for per scenario; None where the caller did not say."""
+    extent: RunExtent | None = None
+    """How much the run is to evaluate; None outside of an evaluation."""
     picture: Callable[[dict], np.ndarray] | None = None
     """Upright frame (H, W, 3) uint8 of an unbatched observation, for LeRobot's videos; None asks the
     simulator."""
@@ -142,7 +142,11 @@ class Run:
     def record(self, trial: Trial, *, noise: str, batch_size: int) -> TrialRow:
         """The row of a trial that is over, on disk before this returns; arguments as `Trial.row`."""
         row = trial.row(
-            dataset=self.dataset, dataset_revision=self.dataset_revision, noise=noise, batch_size=batch_size
+            dataset=self.dataset,
+            dataset_revision=self.dataset_revision,
+            noise=noise,
+            batch_size=batch_size,
+            extent=self.extent,
         )
         self.keep(trial, row)
         if self.log is not None:
@@ -176,7 +180,9 @@ def open_run(
     facts = facts or RunFacts()
     _check_batch(facts)
     platform = spec.slot.platform
-    scenarios = _of_this_run(_load(options, platform) if scenarios is None else scenarios, options, platform)
+    scenarios = _load(options, platform) if scenarios is None else scenarios
+    selected = len(scenarios)
+    scenarios = _of_this_run(scenarios, options, platform)
     _check_versions(scenarios, platform, spec.assets, options.strict_versions)
     start = Start(options.start)
     decisive = {**spec.decisive, "handoff_check": options.handoff_check}
@@ -220,7 +226,7 @@ def open_run(
         dataset=scenarios.source,
         dataset_revision=scenarios.revision,
         handoff_check=options.handoff_check,
-        n_trials=facts.n_episodes,
+        extent=RunExtent(selected, facts.n_episodes, options.shard),
         picture=spec.picture,
         intervention=facts.intervention,
         real_time=real_time,

@@ -30,7 +30,7 @@ import numpy as np
 from lerobot_roborecover.env.directives import Directive
 from lerobot_roborecover.env.intervention_record import InterventionRecord
 from lerobot_roborecover.env.real_time import MovingClock, RealTime
-from lerobot_roborecover.env.trial_row import Protocol, TrialRow, make_row, trial_key, trial_seed
+from lerobot_roborecover.env.trial_row import Protocol, RunExtent, TrialRow, make_row, trial_key, trial_seed
 from lerobot_roborecover.replay import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
 from lerobot_roborecover.workers.messages import (
@@ -300,7 +300,15 @@ class Trial:
         type."""
         return np.stack(self._executed) if self._executed else np.empty((0, self._action_width), np.float32)
 
-    def row(self, *, dataset: str, dataset_revision: str | None, noise: str, batch_size: int) -> TrialRow:
+    def row(
+        self,
+        *,
+        dataset: str,
+        dataset_revision: str | None,
+        noise: str,
+        batch_size: int,
+        extent: RunExtent | None = None,
+    ) -> TrialRow:
         """Its row.
 
         Args:
@@ -308,6 +316,7 @@ class Trial:
             dataset_revision: and which version of it.
             noise: how the policy's noise was drawn, see `TrialRow.noise`.
             batch_size: trials that shared a policy batch, at most.
+            extent: how much its run was to evaluate.
 
         Raises:
             RuntimeError: it is not over, or was skipped.
@@ -329,6 +338,7 @@ class Trial:
             actions_sha256=actions_digest(self._executed),
             interventions=self._record.entries(),
             progress=self._progress or None,
+            extent=extent,
         )
 
     def __repr__(self) -> str:

@@ -15,8 +15,9 @@ from typing import Any
 
 from lerobot_roborecover.scenario import DeviationType, Outcome, Source, Stage, Start
 
-TRIAL_SCHEMA = 2
-"""1: rows without `progress`; they are read as rows that say nothing of it."""
+TRIAL_SCHEMA = 3
+"""1: rows without `progress`. 2: rows without `first_state`, `policy_settings`, `run_scenarios`, `run_trials`
+and `shard`. Both are read as rows that say nothing of these."""
 MAX_LINE_BYTES = 2**24
 """Longest line of a log; a row has about 1.5 kB."""
 MAX_STEPS = 100_000
@@ -90,6 +91,25 @@ def _member(enum: type[StrEnum]) -> Callable[[str, Any], None]:
 def _sha256(field: str, value: Any) -> None:
     if not isinstance(value, str) or len(value) != 64 or set(value) - set("0123456789abcdef"):
         raise _refuse(field, value, "not a SHA-256 of 64 hexadecimal digits")
+
+
+def _sha256_or_empty(field: str, value: Any) -> None:
+    if value != "":
+        _sha256(field, value)
+
+
+def _optional_size(field: str, value: Any) -> None:
+    if value is not None and (type(value) is not int or not 1 <= value <= MAX_TRIALS):
+        raise _refuse(field, value, f"neither null nor a count from 1 to {MAX_TRIALS}")
+
+
+def _shard(field: str, value: Any) -> None:
+    if value == "":
+        return
+    k, _, n = value.partition("/") if isinstance(value, str) else ("", "", "")
+    good = all(part.isascii() and part.isdigit() and len(part) <= 7 for part in (k, n))
+    if not good or not int(k) < int(n):
+        raise _refuse(field, value, "neither empty nor k/n with k from 0 to n - 1")
 
 
 def _moment(field: str, value: Any) -> None:
@@ -269,19 +289,24 @@ _CHECKS: dict[str, Callable[[str, Any], None]] = {
     "config_hash": _NAME,
     "finished_at": _moment,
     "progress": _progress,
+    "first_state": _sha256_or_empty,
+    "policy_settings": _object,
+    "run_scenarios": _optional_size,
+    "run_trials": _optional_size,
+    "shard": _shard,
 }
 """A check for every field of a row, in the order of `TrialRow`."""
 _NAMES = frozenset(_CHECKS)
 _REPEATED = tuple(
     name
     for name, check in _CHECKS.items()
-    if check in (_identifier, _sha256, _LONG_NAME, _NAME, _NAME_OR_EMPTY, _text)
+    if check in (_identifier, _sha256, _sha256_or_empty, _shard, _LONG_NAME, _NAME, _NAME_OR_EMPTY, _text)
     or name in ("stage", "deviation", "source", "start", "outcome", "dataset_revision")
 )
 """Texts that many rows share."""
-_OWN = tuple(
-    item for item in _CHECKS.items() if item[0] not in (*_REPEATED, "options", "versions", "interventions")
-)
+_SHARED = ("options", "versions", "policy_settings")
+"""Objects that many rows share."""
+_OWN = tuple(item for item in _CHECKS.items() if item[0] not in (*_REPEATED, *_SHARED, "interventions"))
 """Fields whose value is the row's alone."""
 _RARE = ("reason", "actions_sha256")
 """Texts among the repeated that need not be: remembering all of them would keep them all."""
@@ -295,7 +320,7 @@ class RowChecker:
 
     def __init__(self) -> None:
         self._texts: dict[str, dict[str, str]] = {name: {} for name in _REPEATED}
-        self._objects: dict[str, dict[str, dict]] = {"options": {}, "versions": {}}
+        self._objects: dict[str, dict[str, dict]] = {name: {} for name in _SHARED}
 
     def check(self, record: object) -> dict[str, Any]:
         """The record, its repeated values shared.
@@ -311,8 +336,8 @@ class RowChecker:
                 f"a JSON {type(record).__name__}, not an object with a row's fields. {_REMEDY}"
             )
         _schema("schema", record.get("schema"))
-        if record["schema"] == 1:
-            _say_nothing_of_progress(record)
+        if record["schema"] < TRIAL_SCHEMA:
+            _upgrade(record)
         if record.keys() != _NAMES:
             odd = min(record.keys() ^ _NAMES)
             raise FieldProblem(f"field {_shown(odd)} is missing or not known. {_REMEDY}")
@@ -348,9 +373,15 @@ class RowChecker:
         return value
 
 
-def _say_nothing_of_progress(record: dict[str, Any]) -> None:
-    """Makes a row of schema 1 one of today's."""
-    record.setdefault("progress", None)
+_SINCE_3 = {"first_state": "", "policy_settings": {}, "run_scenarios": None, "run_trials": None, "shard": ""}
+
+
+def _upgrade(record: dict[str, Any]) -> None:
+    """Makes a row of an earlier schema one of today's, which says nothing of what it lacks."""
+    if record["schema"] == 1:
+        record.setdefault("progress", None)
+    for name, unsaid in _SINCE_3.items():
+        record.setdefault(name, unsaid)
     record["schema"] = TRIAL_SCHEMA
 
 

@@ -30,6 +30,8 @@ class Protocol:
     """Seed of the run; None where the caller gave none."""
     execution_horizon: int | None
     """Actions executed per inference (`n_action_steps`), where the policy says."""
+    policy_settings: Mapping[str, Any] = field(default_factory=dict)
+    """Everything about the policy beside its files that can change a result, see `TrialRow`."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """What else decides a result: observation size, control mode, handoff check, and the like."""
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -44,6 +46,18 @@ class Protocol:
     def config_hash(self) -> str:
         """Short hash of everything above."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class RunExtent:
+    """How much a run was to evaluate; every row says it, so that a log shows what is missing."""
+
+    scenarios: int
+    """Scenarios of the selection, over all shards."""
+    trials: int | None
+    """Trials per scenario; None where the caller did not say."""
+    shard: str = "0/1"
+    """`k/n`, k from 0, as the option has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +131,18 @@ class TrialRow:
     """How much of the task was done where the policy took over, and after each of its steps, in whole per
     cent; None where the platform does not tell, and in logs of schema 1. A rollback puts the number of the
     state that it went to in place of the last one."""
+    first_state: str = ""
+    """Hash of the task's first state (`TrialStart.first_state_sha256`): initial-state trials of scenarios
+    that share it are the same trial. Empty in logs before schema 3."""
+    policy_settings: dict = field(default_factory=dict)
+    """Everything about the policy beside its files that can change a result: options after the command line,
+    rename map, mapping file. Empty in logs before schema 3."""
+    run_scenarios: int | None = None
+    """Scenarios that the run's selection has, over all its shards; None in logs before schema 3."""
+    run_trials: int | None = None
+    """Trials per scenario that the run asked for; None where the caller did not say."""
+    shard: str = ""
+    """Part of the selection that the run had, `k/n` with k from 0; empty in logs before schema 3."""
 
     def key(self) -> tuple:
         """What makes it the same trial: a rerun that meets the key again skips it."""
@@ -154,6 +180,7 @@ def make_row(
     actions_sha256: str,
     interventions: Iterable = (),
     progress: Sequence[int] | None = None,
+    extent: RunExtent | None = None,
 ) -> TrialRow:
     """The one place where a trial row is built."""
     labels = scenario.labels
@@ -203,6 +230,11 @@ def make_row(
         config_hash=protocol.config_hash(),
         finished_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
         progress=None if progress is None else list(progress),
+        first_state=scenario.first_state_sha256(),
+        policy_settings=dict(protocol.policy_settings),
+        run_scenarios=extent.scenarios if extent else None,
+        run_trials=extent.trials if extent else None,
+        shard=extent.shard if extent else "",
     )
 
 

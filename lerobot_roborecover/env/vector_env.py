@@ -191,7 +191,8 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
 
     def _skip_what_is_done(self, trial: Trial) -> None:
         """Ends a trial that needs no simulator: surplus to the request, or finished in an earlier run."""
-        if self.run.n_trials is not None and trial.index >= self.run.n_trials:
+        wanted = self.run.extent.trials if self.run.extent is not None else None
+        if wanted is not None and trial.index >= wanted:
             trial.skip()
         elif self.run.log is not None and (found := self.run.log.find(trial.key)) is not None:
             trial.skip(success=found.success, steps=found.steps)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 
 from lerobot_roborecover.env.trial_log import TrialLog, TrialLogError, read_trial_log
@@ -133,6 +134,49 @@ def test_logs_of_before_progress_are_read_and_joined(tmp_path):
         log.write_text(json.dumps(new | {"progress": wrong}) + "\n", encoding="utf-8")
         with pytest.raises(TrialLogError, match="field 'progress'"):
             read_trial_log(log)
+
+
+def test_logs_of_before_first_states_are_read(tmp_path):
+    """Schema 2 said neither the first state nor the policy's settings nor how much its run was to evaluate."""
+    new = asdict(trial_row(0, first_state="a" * 64, run_scenarios=10, run_trials=5, shard="1/3"))
+    old = asdict(trial_row(1))
+    old["schema"] = 2
+    for name in ("first_state", "policy_settings", "run_scenarios", "run_trials", "shard"):
+        del old[name]
+    log = tmp_path / "trials.jsonl"
+    log.write_text("".join(json.dumps(r) + "\n" for r in (new, old)), encoding="utf-8")
+    first, second = read_trial_log(log)
+    assert asdict(first) == new
+    assert (second.first_state, second.policy_settings, second.run_scenarios, second.shard) == (
+        "",
+        {},
+        None,
+        "",
+    )
+    wrong = {
+        "first_state": "ab",
+        "policy_settings": [],
+        "run_scenarios": 0,
+        "run_trials": "5",
+        "shard": "3/3",
+    }
+    for name, value in wrong.items():
+        log.write_text(json.dumps(new | {name: value}) + "\n", encoding="utf-8")
+        with pytest.raises(TrialLogError, match=f"field '{name}'"):
+            read_trial_log(log)
+
+
+def test_scenarios_of_one_first_state_share_its_hash():
+    """The recovery point does not count; the reset, the task and the settling actions do."""
+    first, *others = (fake_scenario(seed) for seed in range(3))
+    longer = replace(
+        first, id="longer", prefix=np.vstack([first.prefix, first.prefix[-1:]]), fingerprint=None
+    )
+    assert longer.sha256() != first.sha256()
+    assert longer.first_state_sha256() == first.first_state_sha256()
+    elsewhere = replace(first, reset=replace(first.reset, seed=987_654))
+    renamed = replace(first, task=replace(first.task, instruction="another"))
+    assert len({s.first_state_sha256() for s in (first, elsewhere, renamed, *others)}) == 5
 
 
 def test_every_step_has_its_progress(tmp_path):
