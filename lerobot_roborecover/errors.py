@@ -10,3 +10,7 @@ class RoboRecoverError(Exception):
 
 class OptionError(RoboRecoverError, ValueError):
     """An option's value cannot be used; the message names it, the limit and the remedy."""
+
+
+class InUseError(RoboRecoverError, RuntimeError):
+    """Another process has the file open; the message names the file."""

@@ -23,7 +23,6 @@ from lerobot_roborecover.env.trial_row import TrialRow, row_of
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.journal import AppendOnly, InUseError, append_records, complete_lines
 from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.whole import write_whole
 
 
 class TrialLogError(RoboRecoverError, ValueError):
@@ -242,9 +241,7 @@ class TrialLog:
             out = {r.key() for r in gone}
             kept = [r for r in rows if r.key() not in out]
             append_records(to, *map(asdict, gone))
-            self._file.close()
-            write_whole(self.path, "".join(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept))
-            self._file = AppendOnly(self.path)
+            self._file.replace(json.dumps(asdict(r), allow_nan=False).encode() for r in kept)
             for key in out:
                 del self._done[key]
         return len(gone)

@@ -14,7 +14,6 @@ from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER, ballot
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.journal import Journal, read_journal
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
 
 
 def gather_votes(sources: Sequence[Path], root: Path, there: set[str]) -> dict[str, list[dict[str, Any]]]:
@@ -75,7 +74,7 @@ def write_votes(root: Path, votes: Mapping[str, Sequence[Mapping[str, Any]]]) ->
         path = root / FOLDER / VOTES_FOLDER / f"{name}.jsonl"
         with Journal(path, VOTES_SCHEMA) as journal:  # refuses where an annotator is at work
             if journal.records != list(records):
-                write_whole(path, "".join(json.dumps(r) + "\n" for r in records))
+                journal.replace(records)
 
 
 def copy_examples(folders: Sequence[Path], root: Path) -> None:
