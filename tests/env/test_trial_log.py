@@ -159,7 +159,7 @@ def test_logs_of_before_progress_are_read_and_joined(tmp_path):
 
 
 def test_logs_of_before_first_states_are_read(tmp_path):
-    """Schema 2 said neither the first state nor the policy's settings nor how much its run was to evaluate."""
+    """Schema 2 said neither the first state nor the policy's settings nor the extent of its run."""
     new = asdict(trial_row(0, first_state="a" * 64, run_scenarios=10, run_trials=5, shard="1/3"))
     old = asdict(trial_row(1))
     old["schema"] = 2
