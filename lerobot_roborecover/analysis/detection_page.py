@@ -29,8 +29,11 @@ from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_csv, to_latex, to_markdown, to_text
+from lerobot_roborecover.outputs import claim_page
+from lerobot_roborecover.whole import write_whole
 
 SCHEMA_VERSION = 1
+DETECTION_FILES = ("detectors.html", "detectors.md", "detectors.json", "tables", "scores")
 
 
 @dataclass(frozen=True)
@@ -169,17 +172,17 @@ def write_detection_report(
         The page.
     """
     tables = [*_results(measured, pairs, alpha, level), input_table(measured)]
-    (out / "tables").mkdir(parents=True, exist_ok=True)
+    claim_page(out, DETECTION_FILES)
     for table in tables:
-        (out / "tables" / f"{table.name}.csv").write_text(to_csv(table), encoding="utf-8")
-        (out / "tables" / f"{table.name}.tex").write_text(to_latex(table), encoding="utf-8")
-    (out / "detectors.md").write_text("\n".join(map(to_markdown, tables)), encoding="utf-8")
+        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
+        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
+    write_whole(out / "detectors.md", "\n".join(map(to_markdown, tables)))
     reports = {m.name: m.report for m in measured}
     figures = detection_figures(reports)
     films = [strip_figure(strip, scored, reports, seed) for strip in strips]
     for figure in [*figures, *films]:
-        (out / f"{figure.name}.svg").write_bytes(svg_of(figure.plot))
-        (out / f"{figure.name}.png").write_bytes(png_of(figure.plot))
+        write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
+        write_whole(out / f"{figure.name}.png", png_of(figure.plot))
     for name, trials in scored.items():
         _write_scores(out / "scores" / f"{name}.npz", trials)
     numbers = {
@@ -190,12 +193,12 @@ def write_detection_report(
         "detectors": {m.name: detector_json(m) for m in measured},
         "pairs": [_pair_json(c) for c in pairs],
     }
-    (out / "detectors.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
+    write_whole(out / "detectors.json", json.dumps(numbers, indent=1, default=str) + "\n")
     page = render_page(
         "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
         pictures=_pictures(figures), films=_pictures(films),
     )  # fmt: skip
-    (out / "detectors.html").write_text(page, encoding="utf-8")
+    write_whole(out / "detectors.html", page)
     return out / "detectors.html"
 
 

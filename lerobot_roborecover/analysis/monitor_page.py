@@ -32,6 +32,8 @@ from lerobot_roborecover.analysis.style import (
     svg_of,
 )
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown, to_text
+from lerobot_roborecover.outputs import claim_page
+from lerobot_roborecover.whole import write_whole
 
 TITLES = {
     "accuracy": "Acc.",
@@ -41,6 +43,7 @@ TITLES = {
     "macro_f1": "Macro-F1",
     "false_positive_rate": "FPR",
 }
+MONITOR_FILES = ("monitor.html", "monitor.md", "metrics.json", "tables", "frames", "curves")
 _CSV_POINTS = 2000
 """Most points of a curve in its CSV."""
 
@@ -194,15 +197,15 @@ def write_monitor_report(
         The page.
     """
     tables = [metrics_table(measured, level), confusion_table(measured), episode_table(measured)]
-    (out / "tables").mkdir(parents=True, exist_ok=True)
+    claim_page(out, MONITOR_FILES)
     for table in tables:
-        (out / "tables" / f"{table.name}.csv").write_text(to_csv(table), encoding="utf-8")
-        (out / "tables" / f"{table.name}.tex").write_text(to_latex(table), encoding="utf-8")
-    (out / "monitor.md").write_text("\n".join(map(to_markdown, tables)), encoding="utf-8")
+        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
+        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
+    write_whole(out / "monitor.md", "\n".join(map(to_markdown, tables)))
     pictures = []
     for figure in figures(measured):
-        (out / f"{figure.name}.svg").write_bytes(svg_of(figure.plot))
-        (out / f"{figure.name}.png").write_bytes(png_of(figure.plot))
+        write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
+        write_whole(out / f"{figure.name}.png", png_of(figure.plot))
         pictures.append(picture(figure))
     for m in measured:
         _write_frames(out / "frames" / f"{m.name}.csv", m.frames)
@@ -213,11 +216,11 @@ def write_monitor_report(
         "level": level,
         "datasets": {m.name: to_json(m.report) for m in measured},
     }
-    (out / "metrics.json").write_text(json.dumps(numbers, indent=1, default=str) + "\n", encoding="utf-8")
+    write_whole(out / "metrics.json", json.dumps(numbers, indent=1, default=str) + "\n")
     page = render_page(
         "tables_figures.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
     )
-    (out / "monitor.html").write_text(page, encoding="utf-8")
+    write_whole(out / "monitor.html", page)
     return out / "monitor.html"
 
 

@@ -76,10 +76,9 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.env.options import OptionError
     from lerobot_roborecover.env.trial_log import read_trial_log
     from lerobot_roborecover.progress import Progress
-    from lerobot_roborecover.scenario import ScenarioError
+    from lerobot_roborecover.whole import check_new, write_whole
 
-    if args.out.exists() and any(args.out.iterdir()):
-        raise ScenarioError(f"{args.out} is not an empty folder")
+    check_new(args.out)
     rows = [row for log in args.logs for row in read_trial_log(log)]
     names = {row.policy for row in rows}
     base, *alike = (p if p in names else policy_identity(p) for p in (args.base, *args.deterministic))
@@ -126,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     note = donors.describe(options, base, funnel)
     if args.statistics_of or Path(args.base).is_dir():
         use_statistics_of(args.out, Path(args.statistics_of or args.base))
-    (args.out / FOLDER / MANIFEST_FILE).write_text(json.dumps(note, indent=1) + "\n")
+    write_whole(args.out / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
     print(donors.funnel_table(funnel))
     print(
         f"\nlerobot-train --config_path=policies/train/correction_act.yaml --dataset.repo_id=local/donors "

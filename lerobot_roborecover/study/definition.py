@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.whole import write_whole
 
 DEFINITION_FILE = "study.json"
 OUTCOMES_FILE = "outcomes.csv"
@@ -142,7 +143,7 @@ def write_definition(study: StudyDefinition) -> Path:
         **({"dataset": study.dataset} if study.dataset else {}),
         **({"policies_folder": study.policies_folder} if study.policies_folder else {}),
     }
-    path.write_text(json.dumps(found, indent=2) + "\n")
+    write_whole(path, json.dumps(found, indent=2) + "\n")
     return path
 
 

@@ -26,6 +26,7 @@ from lerobot_roborecover.study.outcomes import (
     read_outcomes,
 )
 from lerobot_roborecover.trials.sizes import usable_cores
+from lerobot_roborecover.whole import write_whole
 
 DONE_FILE = "done.json"
 """Beside the log of an arm that has finished: the run that it was."""
@@ -82,7 +83,7 @@ def evaluate(
         began = time.monotonic()
         if not _finished(arm, ids):
             run_arm(arm, study)
-            (arm.out / DONE_FILE).write_text(_what_ran(arm, ids))
+            write_whole(arm.out / DONE_FILE, _what_ran(arm, ids))
         return time.monotonic() - began
 
     with ThreadPoolExecutor(jobs) as pool:

@@ -27,7 +27,7 @@ from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.eval_info import eval_info
+from lerobot_roborecover.trials.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
@@ -36,6 +36,7 @@ from lerobot_roborecover.trials.units import OrderedQueue, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
 from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.workplace import Workplace
+from lerobot_roborecover.whole import write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -194,6 +195,8 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
+    if not run.rows():
+        check_eval_info(out / "eval_info.json", log.path)
     if cfg.runner.retried:
         again, beside = run.retry(cfg.runner.retried)
         print(f"{counted(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)
@@ -303,7 +306,7 @@ def report(cfg: RecoveryEvalConfig, run: Run, scenarios: ScenarioSet, films: Seq
     out = cfg.folder
     out.mkdir(parents=True, exist_ok=True)
     info = eval_info(rows, cfg.recovery_env.group_by, videos)
-    (out / "eval_info.json").write_text(json.dumps(info, indent=2) + "\n")
+    write_whole(out / "eval_info.json", json.dumps(info, indent=2) + "\n")
     print(format_table(summarise([asdict(r) for r in rows])))
     print(f"\ntrial log {run.kept_log().path}\neval info {out / 'eval_info.json'}")
     if films:
