@@ -198,7 +198,9 @@ def write(args: argparse.Namespace, result: Conversion) -> int:
     if pictures or not (out / FOLDER / "conversion.json").is_file():
         check_new(out)
     elif (out / FOLDER / SPLIT_FILE).exists():
-        raise ScenarioError(f"{out} was converted and then divided: results may rest on it. Name another --out")
+        raise ScenarioError(
+            f"{out} was converted and then divided: results may rest on it. Name another --out"
+        )
     earlier = read_earlier(out, args.fingerprint)
     said = {"description": "The paper's release, converted.", "license": args.license}
     deviations: dict[str, dict[str, float]] | None = None

@@ -1,9 +1,10 @@
 """The one rule for the files that commands write: no result is replaced unless the user says so.
 
 - A result that exists is refused. Where a command has `--force`, that replaces it.
-- A page that is made from results, such as a report, replaces an earlier page of the same command. It replaces
+- A page that is made from results, such as a report, replaces an earlier page of the same command, and
   no other file of those names.
-- A file that a process has locked, such as the log of a running evaluation, is never replaced (`whole.new_file`).
+- A file that a process has locked, such as the log of a running evaluation, is never replaced
+  (`whole.new_file`).
 
 Folders of datasets are new or empty (`whole.check_new`).
 """
@@ -61,7 +62,8 @@ def check_page(
     Args:
         folder: of the page; made by the caller if need be. Its files of other names stay.
         names: files and folders that are written there, the main page first.
-        made_here: whether a file is an earlier main page; by default, whether this package made that HTML page.
+        made_here: whether a file is an earlier main page; by default, whether it is an HTML page of
+            this package.
 
     Raises:
         OutputExistsError: a file or folder of these names exists that this command did not make.
@@ -74,8 +76,8 @@ def check_page(
     found = [name for name in names if (folder / name).is_symlink() or (folder / name).exists()]
     if found:
         raise OutputExistsError(
-            f"{folder / found[0]} exists and was not made by this command, so it is not replaced. Name another "
-            "--out, or move the file away"
+            f"{folder / found[0]} exists and was not made by this command, so it is not replaced. Name "
+            "another --out, or move the file away"
         )
 
 

@@ -7,6 +7,7 @@ import os
 
 import pytest
 
+from lerobot_roborecover import whole
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.env.trial_log import TrialLog, read_trial_log
 from lerobot_roborecover.errors import InUseError
@@ -32,14 +33,17 @@ def test_a_locked_file_is_never_replaced(tmp_path):
     assert log.path.read_text() == "other"
 
 
-def test_a_file_that_is_locked_while_its_successor_is_written_is_not_replaced(tmp_path, monkeypatch):
-    from lerobot_roborecover import whole
-
+def test_a_file_that_is_locked_while_its_successor_is_written_is_not_replaced(tmp_path):
     path, opened = tmp_path / "log.jsonl", []
     write_log(path, [trial_row(0)])
-    with pytest.raises(InUseError), whole.new_file(path) as temporary:
-        temporary.write_text("other")
-        opened.append(TrialLog(path))
+
+    def run_begins_meanwhile():
+        with whole.new_file(path) as temporary:
+            temporary.write_text("other")
+            opened.append(TrialLog(path))
+
+    with pytest.raises(InUseError):
+        run_begins_meanwhile()
     opened[0].append(trial_row(1))
     opened[0].close()
     assert [r.scenario_id for r in read_trial_log(path)] == ["s000", "s001"]

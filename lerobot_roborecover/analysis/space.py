@@ -18,8 +18,8 @@ from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.datasets.load import HUB_ID
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.outputs import claim_page
+from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import write_whole
 
 

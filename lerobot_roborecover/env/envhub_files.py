@@ -8,8 +8,8 @@ from lerobot_roborecover.datasets.card import render_card, render_text
 from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
 from lerobot_roborecover.env.envhub import HubScenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.outputs import check_page
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.whole import write_whole
 
 

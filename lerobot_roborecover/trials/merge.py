@@ -95,8 +95,8 @@ def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False, force: bool
     check_new_file(out, force=force, inputs=logs)
     if record_path(out).exists():
         raise OutputExistsError(
-            f"{record_path(out)} says how another run was watched and would be read as the merged log's. Name "
-            "another file, or move that record away"
+            f"{record_path(out)} says how another run was watched and would be read as the merged log's. "
+            "Name another file, or move that record away"
         )
     found: dict[tuple, tuple[TrialRow, str]] = {}
     remarks: list[str] = []

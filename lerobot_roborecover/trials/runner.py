@@ -34,9 +34,9 @@ from lerobot_roborecover.trials.progress import ProgressLine, Tally
 from lerobot_roborecover.trials.sequential import ALONE, open_watch
 from lerobot_roborecover.trials.units import OrderedQueue, UnitQueue
 from lerobot_roborecover.trials.videos import VideoKeeper
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.words import counted
 from lerobot_roborecover.workers.workplace import Workplace
-from lerobot_roborecover.whole import write_whole
 
 logger = logging.getLogger(__name__)
 

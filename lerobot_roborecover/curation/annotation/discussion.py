@@ -14,8 +14,8 @@ from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.datasets.files import read_bytes
-from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.outputs import check_new_file
+from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import write_whole
 
 SCHEMA_VERSION = 1
