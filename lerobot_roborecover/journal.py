@@ -265,19 +265,6 @@ class Journal:
             raise ScenarioError(f"{self.path} could not be written: {err}. Make room on the disk") from err
         self.records += whole
 
-    def replace(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Replaces all records, each with its schema version, without letting go of the file.
-
-        Raises:
-            ScenarioError: they could not be written; the file is as it was.
-        """
-        whole = [dict(record) for record in records]
-        try:
-            self._file.replace(json.dumps(r, allow_nan=False).encode() for r in whole)
-        except OSError as err:
-            raise ScenarioError(f"{self.path} could not be written: {err}. Make room on the disk") from err
-        self.records = whole
-
     def close(self) -> None:
         """Lets go of the file."""
         self._file.close()

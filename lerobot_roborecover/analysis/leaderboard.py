@@ -31,6 +31,7 @@ from lerobot_roborecover.analysis.runs import method_rate, run_rates
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.env.log_file import LOG_SUFFIXES
 from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.scenario import Start
@@ -128,7 +129,7 @@ class Leaderboard:
 def make_leaderboard(
     folder: Path, options: Options | None = None, methods: Sequence[str] = ()
 ) -> Leaderboard:
-    """Reads every `.jsonl` below a folder.
+    """Reads every `.jsonl` below a folder, compressed ones (`.gz`, `.zst`) too.
 
     Args:
         folder: where the logs are, at any depth.
@@ -140,7 +141,7 @@ def make_leaderboard(
         RowsError: the folder does not exist, or holds no log at all; or a method's log is not there.
     """
     options = options or Options()
-    files = sorted(folder.rglob("*.jsonl")) if folder.is_dir() else []
+    files = sorted(p for s in LOG_SUFFIXES for p in folder.rglob(f"*{s}")) if folder.is_dir() else []
     if not files:
         raise RowsError(f"no trial logs (*.jsonl) below {folder}")
     run_of_file = _methods(folder, files, methods)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import json
-import os
 import sys
 import typing
 from collections.abc import Collection, Generator, Iterable, Iterator
@@ -17,7 +16,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
+from unicodedata import normalize
 
+from lerobot_roborecover.env.log_file import LogFileError, appendable, open_log
 from lerobot_roborecover.env.trial_check import MAX_LINE_BYTES, FieldProblem, RowChecker, parse_json
 from lerobot_roborecover.env.trial_row import TrialRow, row_of
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
@@ -91,19 +92,17 @@ def read_log(path: Path, policy: str | None = None) -> ReadLog:
         TrialLogError: the file cannot be read as a trial log; names the line and the field.
     """
     try:
-        with open(path, "rb") as file, _collector_paused():
+        with open_log(Path(path)) as log, _collector_paused():
             policies: dict[str, None] = {}
             lines: list[int] = []
             rows: list[TrialRow] = []
-            for line, row in _checked_rows(complete_lines(file, MAX_LINE_BYTES), str(path)):
-                policies[row.policy] = None
-                if policy is not None:
-                    object.__setattr__(row, "policy", policy)  # nobody has seen the row yet
+            for line, row in _checked_rows(complete_lines(log.file, MAX_LINE_BYTES), str(path)):
+                policies[normalize("NFC", row.policy)] = None
+                # Nobody has seen the row yet. Canonically equal names are one name.
+                object.__setattr__(row, "policy", normalize("NFC", row.policy if policy is None else policy))
                 lines.append(line)
                 rows.append(row)
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - 1, 0))
-            cut = file.read(1) not in (b"\n", b"")
+            cut = log.cut
     except (OSError, ValueError) as err:  # ValueError: a path with a NUL
         if isinstance(err, TrialLogError):
             raise
@@ -189,7 +188,10 @@ class TrialLog:
     def __init__(self, path: Path):
         self.path = Path(path)
         try:
+            appendable(self.path)
             self._file = AppendOnly(self.path)
+        except LogFileError as err:
+            raise TrialLogError(f"cannot add to trial log {path}: {err}") from None
         except InUseError:
             raise TrialLogError(
                 f"trial log {path} is in use by another process. Wait for it, or give this run a "
