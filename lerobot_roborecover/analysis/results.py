@@ -29,6 +29,7 @@ from lerobot_roborecover.analysis.runs import (
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.scenario import Start
 
 
@@ -53,6 +54,7 @@ class Options:
     """Whether all pairs are tested so that the logs may be looked at while they grow."""
 
     def __post_init__(self):
+        check_seed(self.seed)
         if self.draws < 100:
             raise RowsError(
                 f"--draws={self.draws} bootstrap draws cannot give an interval; take at least 100"

@@ -52,11 +52,7 @@ class _Bytes(io.RawIOBase):
     def readinto(self, buffer, /) -> int:
         try:
             data = self._source.read(len(buffer))
-        except (EOFError, zlib.error, gzip.BadGzipFile) as err:
-            raise LogFileError(
-                f"its compressed data is damaged or cut short ({err}). Fetch it again"
-            ) from None
-        except (OSError, ValueError) as err:  # of Arrow
+        except (EOFError, OSError, ValueError, zlib.error) as err:
             raise LogFileError(
                 f"its compressed data is damaged or cut short ({str(err)[:200]}). Fetch it again"
             ) from None
@@ -74,7 +70,7 @@ class LogReader:
         raw: where these come from.
     """
 
-    def __init__(self, file: io.BufferedReader, raw: _Bytes):
+    def __init__(self, file: BinaryIO, raw: _Bytes):
         self.file, self._raw = file, raw
 
     @property
@@ -93,8 +89,10 @@ def open_log(path: Path) -> Generator[LogReader]:
     """
     _check_regular(path)
     with ExitStack() as stack:
-        plain = stack.enter_context(open(path, "rb", buffering=_HEAD_BYTES))
-        source = _decompressed(plain, plain.peek(4)[:4], stack)
+        plain = stack.enter_context(open(path, "rb"))
+        magic = plain.read(4)
+        plain.seek(0)
+        source = _decompressed(plain, magic, stack)
         raw = _Bytes(source)
         file = stack.enter_context(io.BufferedReader(raw, _HEAD_BYTES))
         if problem := text_problem(file.peek(_HEAD_BYTES)):
@@ -116,7 +114,8 @@ def appendable(path: Path) -> None:
         return
     if head.startswith((_GZIP, _ZSTD)):
         raise LogFileError(
-            "it is compressed, which is read and not added to. Decompress it (gunzip or unzstd), or name another"
+            "it is compressed, which is read and not added to. Decompress it (gunzip or unzstd), or name "
+            "another log"
         )
     if problem := text_problem(head):
         raise LogFileError(problem)

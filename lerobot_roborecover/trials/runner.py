@@ -26,6 +26,7 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.trials.engine import units_of
 from lerobot_roborecover.trials.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
@@ -184,6 +185,7 @@ class Stopper:
 def evaluate(cfg: RecoveryEvalConfig) -> int:
     """Runs the evaluation that a command line asks for; see `main`."""
     cfg.runner.check()
+    check_seed(cfg.seed)
     env, policy = cfg.recovery_env, cfg.given_policy
     if cfg.eval.recording:
         raise OptionError(

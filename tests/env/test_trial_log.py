@@ -20,10 +20,11 @@ PROTOCOL = Protocol("recovery", 0, "push@1", 1000, 10)
 
 
 def row(trial: int, outcome: Outcome = Outcome.SUCCESS, protocol: Protocol = PROTOCOL):
+    steps = fake_scenario(0).task.horizon if outcome is Outcome.HORIZON else 7
     return make_row(
         fake_scenario(0), protocol, dataset="d", dataset_revision=None, trial=trial,
         noise="per_trial", batch_size=1,
-        outcome=outcome, reason="", steps=7, handoff=None, sim_s=0.1, policy_s=0.2, actions_sha256="",
+        outcome=outcome, reason="", steps=steps, handoff=None, sim_s=0.1, policy_s=0.2, actions_sha256="",
     )  # fmt: skip
 
 
