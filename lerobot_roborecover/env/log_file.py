@@ -25,6 +25,10 @@ class LogFileError(ValueError):
     """A file cannot be read as a trial log; the message says what it is and the remedy."""
 
 
+class LogTextError(LogFileError):
+    """Its text is no log's from the first line on."""
+
+
 class _Source(Protocol):
     def read(self, size: int, /) -> bytes: ...
 
@@ -96,7 +100,7 @@ def open_log(path: Path) -> Generator[LogReader]:
         raw = _Bytes(source)
         file = stack.enter_context(io.BufferedReader(raw, _HEAD_BYTES))
         if problem := text_problem(file.peek(_HEAD_BYTES)):
-            raise LogFileError(problem)
+            raise LogTextError(problem)
         yield LogReader(file, raw)
 
 
@@ -118,7 +122,7 @@ def appendable(path: Path) -> None:
             "another log"
         )
     if problem := text_problem(head):
-        raise LogFileError(problem)
+        raise LogTextError(problem)
 
 
 def text_problem(head: bytes) -> str:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 from unicodedata import normalize
 
-from lerobot_roborecover.env.log_file import LogFileError, appendable, open_log
+from lerobot_roborecover.env.log_file import LogFileError, LogTextError, appendable, open_log
 from lerobot_roborecover.env.trial_check import MAX_LINE_BYTES, FieldProblem, RowChecker, parse_json
 from lerobot_roborecover.env.trial_row import TrialRow, row_of
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
@@ -103,6 +103,8 @@ def read_log(path: Path, policy: str | None = None) -> ReadLog:
                 lines.append(line)
                 rows.append(row)
             cut = log.cut
+    except LogTextError as err:
+        raise TrialLogError(f"{path}, line 1: {err}") from None
     except (OSError, ValueError) as err:  # ValueError: a path with a NUL
         if isinstance(err, TrialLogError):
             raise
@@ -190,6 +192,8 @@ class TrialLog:
         try:
             appendable(self.path)
             self._file = AppendOnly(self.path)
+        except LogTextError as err:
+            raise TrialLogError(f"{path}, line 1: {err}") from None
         except LogFileError as err:
             raise TrialLogError(f"cannot add to trial log {path}: {err}") from None
         except InUseError:
