@@ -12,6 +12,7 @@ from lerobot_roborecover.curation.annotation.examples import EXAMPLES_FOLDER
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
 from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER, ballot
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.journal import read_journal
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import check_unlocked, write_whole
@@ -76,11 +77,14 @@ def write_votes(
         folder: of an update of the dataset, which takes the files; None writes to `root`.
 
     Raises:
-        InUseError: an annotator is at work on them.
+        ScenarioError: an annotator is at work on them.
     """
     for name, records in votes.items():
         path = f"{FOLDER}/{VOTES_FOLDER}/{name}.jsonl"
-        check_unlocked(root / path)
+        try:
+            check_unlocked(root / path)
+        except InUseError as err:
+            raise ScenarioError(str(err)) from None
         if read_journal(root / path, VOTES_SCHEMA) != list(records):
             write_whole((folder or root) / path, "".join(json.dumps(r) + "\n" for r in records))
 
