@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.curation.split_dataset import SPLIT_FILE
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
@@ -194,8 +195,13 @@ def write(args: argparse.Namespace, result: Conversion) -> int:
     """Writes one platform's dataset, reports what failed, and returns the number of scenarios."""
     out, work = args.out / result.platform, args.out / f".{result.platform}.work"
     pictures = args.render or args.last_frames
-    if pictures:
+    # A conversion is replaced by a later one, e.g. with --fingerprint. Splits made from it are kept.
+    if pictures or not (out / FOLDER / "conversion.json").is_file():
         check_new(out)
+    elif (out / FOLDER / SPLIT_FILE).exists():
+        raise ScenarioError(
+            f"{out} was converted and then divided: results may rest on it. Name another --out"
+        )
     earlier = read_earlier(out, args.fingerprint)
     said = {"description": "The paper's release, converted.", "license": args.license}
     deviations: dict[str, dict[str, float]] | None = None

@@ -8,6 +8,8 @@ import os
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 
+MAX_SEED = 2**63
+
 
 class RoboRecoverError(Exception):
     """Something cannot be used or done; the message is all that a user needs."""
@@ -60,3 +62,21 @@ def os_error_line(error: OSError) -> str:
     parts = [f"{where}{reason}", _REMEDIES.get(error.errno, "")]
     parts += ["Finished trials are kept"] if error.errno in _WRITING else []
     return ". ".join(filter(None, parts))
+
+
+def check_seed(seed: int | None, option: str = "--seed") -> None:
+    """Checks a seed of random draws.
+
+    Args:
+        seed: None draws without one, and is accepted.
+        option: what the user calls it.
+
+    Raises:
+        OptionError: no generator takes it.
+    """
+    if seed is not None and not 0 <= seed < MAX_SEED:
+        raise OptionError(f"{option}={seed}: must be from 0 to {MAX_SEED - 1}")
+
+
+class InUseError(RoboRecoverError, RuntimeError):
+    """Another process has the file open; the message names the file."""

@@ -12,6 +12,7 @@ import logging
 import os
 from enum import Enum
 from functools import cache
+from pathlib import Path
 from typing import IO, Any
 
 logger = logging.getLogger(__name__)
@@ -50,6 +51,15 @@ def lock_file(file: IO[Any], operation: int) -> LockResult:
             return LockResult.UNSUPPORTED
         raise OSError(err.errno, err.strerror, file.name) from None
     return LockResult.HELD
+
+
+def is_still_at(file: IO[Any], path: Path) -> bool:
+    """Returns whether a path still names an open file, rather than another one put in its place."""
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        return False
+    return os.path.samestat(found, os.fstat(file.fileno()))
 
 
 @cache

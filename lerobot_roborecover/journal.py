@@ -12,22 +12,19 @@ import fcntl
 import json
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-from lerobot_roborecover.errors import naming
-from lerobot_roborecover.file_locks import LockResult, lock_file
+from lerobot_roborecover.errors import InUseError, naming
+from lerobot_roborecover.file_locks import LockResult, is_still_at, lock_file
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import sync_folder
+from lerobot_roborecover.whole import new_file, sync_folder
 
 MAX_JOURNAL_BYTES = 2**28
 _BLOCK = 2**16
-
-
-class InUseError(RuntimeError):
-    """Another process has the file open."""
 
 
 def open_locked(path: Path, mode: str) -> IO[Any]:
@@ -38,14 +35,18 @@ def open_locked(path: Path, mode: str) -> IO[Any]:
         InUseError: another process has it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = open(path, mode)  # noqa: SIM115 - lives as long as whoever asked
-    try:
-        if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
-            raise InUseError(f"{path} is in use by another process")
-    except BaseException:
+    while True:
+        file = open(path, mode)  # noqa: SIM115 - lives as long as whoever asked
+        try:
+            if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
+                raise InUseError(f"{path} is in use by another process")
+            if is_still_at(file, path):
+                return file
+        except BaseException:
+            file.close()
+            raise
+        # Another process has put a new file in its place between the opening and the lock.
         file.close()
-        raise
-    return file
 
 
 class AppendOnly:
@@ -109,6 +110,25 @@ class AppendOnly:
         except OSError:
             os.ftruncate(number, size)
             raise
+
+    def replace(self, lines: Iterable[bytes]) -> None:
+        """Replaces all lines; the file is locked throughout, and a crash leaves the old or the new lines.
+
+        Args:
+            lines: without their ends.
+
+        Raises:
+            OSError: they could not be written; the file is as it was.
+        """
+        with ExitStack() as stack:
+            with new_file(self.path, held=self._file) as temporary:
+                # Locked before it has the file's name, so that no other process can be first.
+                file = stack.enter_context(open_locked(temporary, "a+b"))
+                file.writelines(line + b"\n" for line in lines)
+                file.flush()
+            stack.pop_all()
+        old, self._file = self._file, file
+        old.close()
 
     def close(self) -> None:
         """Lets go of the file."""

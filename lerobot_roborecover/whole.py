@@ -17,32 +17,78 @@ import shutil
 import socket
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
+from typing import IO, Any
 
-from lerobot_roborecover.errors import naming
-from lerobot_roborecover.file_locks import LockResult, lock_file
+from lerobot_roborecover.errors import InUseError, naming
+from lerobot_roborecover.file_locks import LockResult, is_still_at, lock_file
 from lerobot_roborecover.scenario import ScenarioError
 
 _DEAD_AFTER_S = 7 * 86400
 
 
 @contextmanager
-def new_file(path: Path) -> Generator[Path]:
-    """A name beside `path`; what the block writes there takes its place when the block ends well."""
+def new_file(path: Path, held: IO[Any] | None = None) -> Generator[Path]:
+    """A name beside `path`; what the block writes there takes its place when the block ends well.
+
+    Args:
+        path: the file. A file that a process has locked, such as a log in use, is never replaced.
+        held: the open file at `path`, where this process has locked it itself.
+
+    Raises:
+        InUseError: another process has locked `path`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    if held is None:
+        check_unlocked(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     _forget_files(path)
     try:
         with naming(path):
             yield temporary
             _to_disk(temporary)
+        with nullcontext() if held is not None else _lock_existing(path):
             os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     # The name is only there after a crash once its folder is on disk, too.
     sync_folder(path.parent)
+
+
+def check_unlocked(path: Path) -> None:
+    """Checks that no process has locked a file; one that does not exist is not locked.
+
+    Raises:
+        InUseError: a process has locked it.
+    """
+    with _lock_existing(path):
+        pass
+
+
+@contextmanager
+def _lock_existing(path: Path) -> Generator[None]:
+    """Holds a file's lock, so that no process begins to write a file that is about to be replaced.
+
+    Raises:
+        InUseError: another process has locked the file.
+    """
+    with ExitStack() as stack:
+        # Neither a device nor a FIFO is opened: that can block.
+        while path.is_file():
+            try:
+                file = stack.enter_context(open(path, "rb"))
+            except OSError:
+                break  # not readable: no run of this user has it open
+            if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
+                raise InUseError(
+                    f"{path} is in use by another process and is not replaced. Wait for that process, or "
+                    "name another file"
+                )
+            if is_still_at(file, path):
+                break
+        yield
 
 
 def write_whole(path: Path, data: str | bytes) -> None:

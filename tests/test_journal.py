@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lerobot_roborecover import journal
 from lerobot_roborecover.journal import (
     AppendOnly,
     InUseError,
@@ -61,6 +63,69 @@ def test_one_process_at_a_time(tmp_path):
         with pytest.raises(ScenarioError, match="in use by another process; stop that one first"):
             Journal(path, 1)
     AppendOnly(path).close()
+
+
+def test_a_file_whose_lines_are_replaced_is_locked_at_every_moment(tmp_path, monkeypatch):
+    path, refused = tmp_path / "a.jsonl", []
+
+    def tried(operation):
+        def wrapped(*args, **kwargs):
+            for _ in ("before", "after"):
+                with pytest.raises(InUseError):
+                    AppendOnly(path)
+                refused.append(operation.__name__)
+                if _ == "before":
+                    result = operation(*args, **kwargs)
+            return result
+
+        return wrapped
+
+    with AppendOnly(path) as file:
+        file.append(b"one", b"two")
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "replace", tried(os.replace))
+            patched.setattr(os, "fsync", tried(os.fsync))
+            file.replace([b"two"])
+        with pytest.raises(InUseError):
+            AppendOnly(path)
+        file.append(b"three")
+        assert list(file.lines()) == [b"two\n", b"three\n"]
+    assert refused.count("replace") == 2
+    assert path.read_bytes() == b"two\nthree\n"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    AppendOnly(path).close()
+
+
+def test_a_failed_replacement_keeps_the_lines_and_the_lock(tmp_path, monkeypatch):
+    path = tmp_path / "a.jsonl"
+    with AppendOnly(path) as file:
+        file.append(b"one")
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "replace", Mock(side_effect=OSError(28, "No space left on device")))
+            with pytest.raises(OSError, match="No space"):
+                file.replace([b"two"])
+        with pytest.raises(InUseError):
+            AppendOnly(path)
+        file.append(b"two")
+    assert path.read_bytes() == b"one\ntwo\n"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_that_is_replaced_before_it_is_locked_is_opened_again(tmp_path, monkeypatch):
+    path, lock_file = tmp_path / "a.jsonl", journal.lock_file
+    path.write_bytes(b"old\n")
+
+    def replaced_first(file, operation):
+        monkeypatch.setattr(journal, "lock_file", lock_file)
+        (tmp_path / "new").write_bytes(b"new\n")
+        os.replace(tmp_path / "new", path)
+        return lock_file(file, operation)
+
+    monkeypatch.setattr(journal, "lock_file", replaced_first)
+    with AppendOnly(path) as file:
+        assert list(file.lines()) == [b"new\n"]
+        file.append(b"more")
+    assert path.read_bytes() == b"new\nmore\n"
 
 
 def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):

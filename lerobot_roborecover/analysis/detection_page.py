@@ -29,9 +29,11 @@ from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_csv, to_latex, to_markdown, to_text
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 SCHEMA_VERSION = 1
+DETECTION_FILES = ("detectors.html", "detectors.md", "detectors.json", "tables", "scores")
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def write_detection_report(
         The page.
     """
     tables = [*_results(measured, pairs, alpha, level), input_table(measured)]
-    (out / "tables").mkdir(parents=True, exist_ok=True)
+    claim_page(out, DETECTION_FILES)
     for table in tables:
         write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
         write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))

@@ -9,6 +9,7 @@ from lerobot_roborecover.analysis.fork_gain import ForkGains, gain_tables
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import render
 from lerobot_roborecover.analysis.tables import Table, to_csv, to_markdown
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 PAGE = "gain.html"
@@ -26,7 +27,7 @@ def write_gains(gains: ForkGains, out: Path, command: str) -> list[Table]:
         The tables.
     """
     tables, figure = gain_tables(gains), gain_by_step(gains)
-    out.mkdir(parents=True, exist_ok=True)
+    claim_page(out, (PAGE, "gain.md", "fork_gain.svg", "fork_gain.png"))
     svg, png = render(figure)
     write_whole(out / "fork_gain.svg", svg)
     write_whole(out / "fork_gain.png", png)

@@ -34,6 +34,7 @@ from lerobot_roborecover.analysis.sequential_record import SequentialRecord, rea
 from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.env.log_file import LOG_SUFFIXES
 from lerobot_roborecover.env.policy_settings import settings_of_method
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
@@ -139,7 +140,7 @@ class Leaderboard:
 def make_leaderboard(
     folder: Path, options: Options | None = None, methods: Sequence[str] = ()
 ) -> Leaderboard:
-    """Reads every `.jsonl` below a folder.
+    """Reads every `.jsonl` below a folder, compressed ones (`.gz`, `.zst`) too.
 
     Args:
         folder: where the logs are, at any depth.
@@ -151,7 +152,7 @@ def make_leaderboard(
         RowsError: the folder does not exist, or holds no log at all; or a method's log is not there.
     """
     options = options or Options()
-    files = sorted(folder.rglob("*.jsonl")) if folder.is_dir() else []
+    files = sorted(p for s in LOG_SUFFIXES for p in folder.rglob(f"*{s}")) if folder.is_dir() else []
     if not files:
         raise RowsError(f"no trial logs (*.jsonl) below {folder}")
     run_of_file = _methods(folder, files, methods)

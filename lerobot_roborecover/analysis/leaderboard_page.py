@@ -12,6 +12,7 @@ from lerobot_roborecover.analysis.macro import MACRO_9
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 
@@ -37,6 +38,7 @@ def write_leaderboard(
     ]
     page = render_page("leaderboard.html.j2", title=title, boards=boards, refused=found.refused)
     files = out / "index.html", out / "leaderboard.json"
+    claim_page(out, [path.name for path in files])
     for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
         write_whole(path, text)
     return files

@@ -23,8 +23,10 @@ from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
+from lerobot_roborecover.analysis.look_alikes import check_names
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.env.log_file import LOG_SUFFIXES
 from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS
 from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
@@ -132,6 +134,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     remarks += unknown
     if twice:
         remarks.append(f"{twice} row(s) occur in more than one log with the same result; each counts once")
+    check_names({row.policy for row in rows.values()})
     kept = [row for row in rows.values() if platform is None or row.platform == platform]
     del rows
     tell_settings_apart([row for row in kept if id(row) not in run_of])
@@ -189,11 +192,13 @@ def _files(logs: Sequence[str]) -> Iterable[tuple[str, int | None, Path]]:
 
 def _in_folder(path: Path, text: str) -> Iterable[Path]:
     if path.is_dir():
-        inside = (
-            [path / "trials.jsonl"] if (path / "trials.jsonl").is_file() else sorted(path.glob("*.jsonl"))
-        )
+        first = [path / f"trials{suffix}" for suffix in LOG_SUFFIXES if (path / f"trials{suffix}").is_file()]
+        inside = first[:1] or sorted(p for suffix in LOG_SUFFIXES for p in path.glob(f"*{suffix}"))
         if not inside:
-            raise TrialLogError(f"no trial log in {path}: a folder must hold trials.jsonl or *.jsonl files")
+            raise TrialLogError(
+                f"no trial log in {path}: a folder must hold trials.jsonl or *.jsonl files, which may be "
+                "compressed (.gz, .zst)"
+            )
         return inside
     if not path.exists():
         raise TrialLogError(f"cannot read trial log {path}: {missing(text, path)}")
@@ -202,7 +207,8 @@ def _in_folder(path: Path, text: str) -> Iterable[Path]:
 
 def _run_name(path: Path) -> str:
     """What a run is called: its log, or the folder of a log that is called like all of them."""
-    return path.parent.name if path.name == "trials.jsonl" and path.parent.name else path.stem
+    name = path.name.partition(".jsonl")[0]
+    return path.parent.name if name == "trials" and path.parent.name else name
 
 
 def _check_platform(rows: Sequence[TrialRow]) -> None:

@@ -15,9 +15,10 @@ from lerobot_roborecover.analysis.logs import Study, read_study
 from lerobot_roborecover.analysis.media import find_clips
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.report import Extras, ReportFiles, write_report
+from lerobot_roborecover.analysis.report import REPORT_FILES, Extras, ReportFiles, write_report
 from lerobot_roborecover.analysis.results import Options, Results, analyse
 from lerobot_roborecover.analysis.tables import to_text
+from lerobot_roborecover.outputs import check_page
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,10 @@ def report(
         TrialLogError: a log cannot be read.
         RowsError: the logs do not belong together.
         ScenarioError: the gallery's scenarios cannot be loaded, or are not the logs'.
+        OutputExistsError: `out` holds files of a report's names that are of no report.
     """
     out, gallery = Path(out), gallery or Gallery()
+    check_page(out, REPORT_FILES)
     study = read_study(_named(logs), platform)
     with _no_garbage_yet():
         results = analyse(study, options)

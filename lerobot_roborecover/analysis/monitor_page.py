@@ -32,6 +32,7 @@ from lerobot_roborecover.analysis.style import (
     svg_of,
 )
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown, to_text
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 TITLES = {
@@ -42,6 +43,7 @@ TITLES = {
     "macro_f1": "Macro-F1",
     "false_positive_rate": "FPR",
 }
+MONITOR_FILES = ("monitor.html", "monitor.md", "metrics.json", "tables", "frames", "curves")
 _CSV_POINTS = 2000
 """Most points of a curve in its CSV."""
 
@@ -195,7 +197,7 @@ def write_monitor_report(
         The page.
     """
     tables = [metrics_table(measured, level), confusion_table(measured), episode_table(measured)]
-    (out / "tables").mkdir(parents=True, exist_ok=True)
+    claim_page(out, MONITOR_FILES)
     for table in tables:
         write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
         write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))

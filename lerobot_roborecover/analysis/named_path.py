@@ -4,6 +4,7 @@ several runs of one method."""
 from __future__ import annotations
 
 from pathlib import Path
+from unicodedata import normalize
 
 from lerobot_roborecover.analysis.estimators import RowsError
 
@@ -22,7 +23,7 @@ def split_named(text: str) -> tuple[str, str]:
     name, _, rest = text.partition("=")
     if not name.strip() or not name.isprintable():
         raise RowsError(f"{text!r}: the name before the first '=' is empty or not printable. Write NAME=PATH")
-    return name, rest
+    return normalize("NFC", name), rest
 
 
 def split_runs(rest: str) -> list[str]:

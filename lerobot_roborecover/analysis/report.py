@@ -22,9 +22,11 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.style import png_of
 from lerobot_roborecover.analysis.tables import Cell, Table, to_csv, to_latex, to_markdown
 from lerobot_roborecover.analysis.units import ESTIMAND
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 REPORT_SCHEMA = 1
+REPORT_FILES = ("report.html", "report.md", "results.json", "figures", "tables")
 
 _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("overall", "forest", ("overall",)),
@@ -91,7 +93,11 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
         results: what to report.
         out: folder; made if need be.
         extras: frames, videos and remarks.
+
+    Raises:
+        OutputExistsError: a file of these names in `out` is of no earlier report.
     """
+    claim_page(out, REPORT_FILES)
     extras = extras or Extras()
     tables = all_tables(results)
     remarks = [*results.remarks, *extras.remarks]

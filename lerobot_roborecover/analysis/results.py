@@ -33,6 +33,7 @@ from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.scenario import Start
 
 MOST_PAIRS = 120
@@ -62,6 +63,7 @@ class Options:
     """Units of the planned scenarios by id, for that; by default those that the rows name."""
 
     def __post_init__(self):
+        check_seed(self.seed)
         if self.draws < 100:
             raise RowsError(
                 f"--draws={self.draws} bootstrap draws cannot give an interval; take at least 100"

@@ -17,6 +17,7 @@ from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.datasets.load import HUB_ID
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.whole import new_file, write_whole
 
@@ -45,10 +46,12 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
 
     Raises:
         RowsError: a folder of videos does not exist.
+        OutputExistsError: `out` holds files of these names that are of no earlier Space.
     """
     config = config or SpaceConfig()
     remarks: list[str] = []
     pages = [f"scenarios-{n + 1}.html" for n in range(len(found.boards))]
+    claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages])
     write_leaderboard(found, out, config.title, pages)
     for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
         frames, problems = _frames(board, trials, out, config.render)

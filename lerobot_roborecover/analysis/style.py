@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from lerobot_roborecover.analysis.glyphs import drawable, families
 from lerobot_roborecover.analysis.tables import NOT_DEFINED
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ def drawing() -> Generator[Callable[..., tuple[Plot, Any]]]:
         FigureCanvasAgg(plot)
         return plot, plot.subplots(**kwargs)
 
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(_rc()):
         yield subplots
 
 
@@ -180,11 +181,30 @@ def number(value: float, spec: str = ".0f") -> str:
     return NOT_DEFINED if math.isnan(value) else format(value, spec)
 
 
+def _rc() -> dict[RcKeyType, Any]:
+    return {**_RC, "font.sans-serif": families()}
+
+
 def _lay_out(plot: Plot) -> None:
     """Makes room for the texts, once: every file of a drawing then has the same places."""
     if (engine := plot.get_layout_engine()) is not None:
+        _make_drawable(plot)
         engine.execute(plot)
         plot.set_layout_engine("none")
+
+
+def _make_drawable(plot: Plot) -> None:
+    """Replaces characters that no font has; labels of axes are set again so that they keep the new text."""
+    from matplotlib.text import Text
+
+    for axes in plot.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            labels = [label.get_text() for label in axis.get_ticklabels()]
+            if any(drawable(label) != label for label in labels):
+                axis.set_ticks(axis.get_ticklocs(), [drawable(label) for label in labels])
+    for text in plot.findobj(Text):
+        if isinstance(text, Text) and drawable(text.get_text()) != text.get_text():
+            text.set_text(drawable(text.get_text()))
 
 
 def svg_of(plot: Plot) -> bytes:
@@ -198,7 +218,7 @@ def svg_of(plot: Plot) -> bytes:
     import matplotlib
 
     data = io.BytesIO()
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(_rc()):
         _lay_out(plot)
         plot.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
     rules = "".join(
@@ -219,7 +239,7 @@ def png_of(plot: Plot) -> bytes:
     import matplotlib
 
     data = io.BytesIO()
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(_rc()):
         _lay_out(plot)
         plot.savefig(data, format="png", dpi=120, facecolor=PAPER, metadata={"Software": None})
     return data.getvalue()

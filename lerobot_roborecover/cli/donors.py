@@ -79,11 +79,9 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.env.options import OptionError
     from lerobot_roborecover.env.trial_log import read_trial_log
     from lerobot_roborecover.progress import Progress
-    from lerobot_roborecover.scenario import ScenarioError
-    from lerobot_roborecover.whole import write_whole
+    from lerobot_roborecover.whole import check_new, write_whole
 
-    if args.out.exists() and any(args.out.iterdir()):
-        raise ScenarioError(f"{args.out} is not an empty folder")
+    check_new(args.out)
     rows = [row for log in args.logs for row in read_trial_log(log)]
     tell_settings_apart(rows)
     names = {row.policy for row in rows}
@@ -123,15 +121,18 @@ def run(args: argparse.Namespace) -> int:
     passed = donors.judge(candidates, trials, options, funnel)
     chosen = donors.deduplicate(passed, options, funnel)
     spec = env_config(scenarios.platform, args.scenarios, [f"--{o}" for o in args.env]).run_spec()
+
+    def finish(folder: Path) -> None:
+        if args.statistics_of or Path(args.base).is_dir():
+            use_statistics_of(folder, Path(args.statistics_of or args.base))
+        note = donors.describe(options, base, funnel)
+        write_whole(folder / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
+
     donors.write_donors(
         args.out, chosen, simulator=spec.slot.options, workers=args.workers, funnel=funnel,
         description=f"Recoveries by other policies where {base} fails, for Correction.", license=args.license,
-        on_trajectory=Progress("replay"),
+        on_trajectory=Progress("replay"), also=finish,
     )  # fmt: skip
-    note = donors.describe(options, base, funnel)
-    if args.statistics_of or Path(args.base).is_dir():
-        use_statistics_of(args.out, Path(args.statistics_of or args.base))
-    write_whole(args.out / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
     print(donors.funnel_table(funnel))
     print(
         f"\nlerobot-train --config_path=policies/train/correction_act.yaml --dataset.repo_id=local/donors "

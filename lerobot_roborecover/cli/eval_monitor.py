@@ -105,12 +105,18 @@ def run(args: argparse.Namespace) -> int:
 def _side_by_side(args: argparse.Namespace) -> int:
     """Detectors on a policy's trials."""
     from lerobot_roborecover import __version__
-    from lerobot_roborecover.analysis.detection_page import detection_text, write_detection_report
+    from lerobot_roborecover.analysis.detection_page import (
+        DETECTION_FILES,
+        detection_text,
+        write_detection_report,
+    )
     from lerobot_roborecover.curation.detection.request import DetectionRequest, compare_detectors
     from lerobot_roborecover.curation.detection.strips import choose_trials, film_strips
     from lerobot_roborecover.curation.detection.trials import TrialSource
+    from lerobot_roborecover.outputs import check_page
     from lerobot_roborecover.progress import Progress
 
+    check_page(args.out, DETECTION_FILES)
     source = TrialSource(
         scenarios=args.scenarios,
         policy=args.policy,
@@ -170,15 +176,22 @@ def _on_frames(args: argparse.Namespace) -> int:
     """One monitor on labelled frames."""
     from lerobot_roborecover import __version__
     from lerobot_roborecover.analysis.monitor_curves import choose_threshold
-    from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, write_monitor_report
+    from lerobot_roborecover.analysis.monitor_page import (
+        MONITOR_FILES,
+        Measured,
+        summary_text,
+        write_monitor_report,
+    )
     from lerobot_roborecover.analysis.monitor_report import monitor_report
     from lerobot_roborecover.analysis.named_path import split_named
     from lerobot_roborecover.curation.monitor_data.judging import judge_dataset
     from lerobot_roborecover.interventions.monitor.errors import MonitorError
     from lerobot_roborecover.interventions.monitor_interface import TrainedMonitor
     from lerobot_roborecover.interventions.monitor_loading import load_monitor
+    from lerobot_roborecover.outputs import check_page
     from lerobot_roborecover.progress import Progress
 
+    check_page(args.out, MONITOR_FILES)
     if args.threshold is not None and args.choose_threshold:
         raise MonitorError("--threshold and --choose-threshold: give one of them")
     if args.threshold is not None and not 0 < args.threshold < 1:

@@ -68,13 +68,16 @@ def run(args: argparse.Namespace) -> int:
             lines += lines_of_log(source, by_id, dropped, args.of)
     lines = without_test(lines, dropped)
     spec = env_config(scenarios.platform, args.scenarios, [f"--{o}" for o in args.env]).run_spec()
+
+    def finish(folder: Path) -> None:
+        if args.statistics_of:
+            use_statistics_of(folder, Path(args.statistics_of))
+
     made = export_training(
         args.out, lines, simulator=spec.slot.options, workers=args.workers, dropped=dropped,
         description=f"Trials by {', '.join(policies_of(lines))}, for training.", license=args.license,
-        on_episode=Progress("episode"),
+        on_episode=Progress("episode"), also=finish,
     )  # fmt: skip
-    if args.statistics_of:
-        use_statistics_of(args.out, Path(args.statistics_of))
     for reason, count in dropped.most_common():
         print(f"left out: {count} {reason}")
     print(

@@ -13,6 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `roborecover merge`."""
     parser.add_argument("logs", nargs="+", type=Path, help="trial logs")
     parser.add_argument("--out", required=True, type=Path, help="the merged log")
+    parser.add_argument("--force", action="store_true", help="replace a file that exists at --out")
     parser.add_argument(
         "--unequal", action="store_true", help="accept scenarios with fewer trials than others"
     )
@@ -23,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.trials.merge import merge
     from lerobot_roborecover.words import counted
 
-    merged = merge(args.logs, args.out, unequal=args.unequal)
+    merged = merge(args.logs, args.out, unequal=args.unequal, force=args.force)
     scenarios = len({r.scenario_id for r in merged.rows})
     for remark in merged.remarks:
         print(f"note: {remark}", file=sys.stderr)

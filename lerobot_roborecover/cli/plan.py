@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.power import plans
     from lerobot_roborecover.analysis.style import png_of, svg_of
     from lerobot_roborecover.analysis.tables import to_csv, to_markdown, to_text
+    from lerobot_roborecover.outputs import check_page
     from lerobot_roborecover.whole import write_whole
 
     _check(args)
@@ -103,11 +104,13 @@ def run(args: argparse.Namespace) -> int:
     for remark in remarks:
         print(f"note: {remark}", file=sys.stderr)
     if args.out is not None:
+        files = ("plan.md", "plan.svg", "plan.png", *(f"{table.name}.csv" for table in tables))
+        check_page(args.out, files, lambda page: b"](plan.svg)" in page.read_bytes())
         figure = detectable_figure(guess, trials, *common, at=at, differences=differences)
-        for table in tables:
-            write_whole(args.out / f"{table.name}.csv", to_csv(table))
         text = f"![{figure.title}](plan.svg)\n\n" + "\n".join(to_markdown(table) for table in tables)
         write_whole(args.out / "plan.md", text)
+        for table in tables:
+            write_whole(args.out / f"{table.name}.csv", to_csv(table))
         write_whole(args.out / "plan.svg", svg_of(figure.plot))
         write_whole(args.out / "plan.png", png_of(figure.plot))
         print(f"plan      {args.out / 'plan.md'}\nfigure    {args.out / 'plan.svg'}")

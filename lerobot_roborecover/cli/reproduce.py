@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     )
     from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, published_score
     from lerobot_roborecover.reproduce.hours import Costs
-    from lerobot_roborecover.reproduce.record import verdict
+    from lerobot_roborecover.reproduce.record import check_record, verdict
 
     if args.name is None:
         print("\n".join(known_names()))
@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
                   f"(simulators {length.simulator_h:.2g}, policy {length.policy_h:.2g})")  # fmt: skip
             print(plan.command_line(start))
         return 0
+    check_record(plan)
     result = run_arms(plan, say=lambda line: print(line, flush=True))
     page, _ = write_record(result)
     print(f"\n{verdict(result)}\nreport {page}", file=sys.stdout)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.journal import Journal, read_journal
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import new_file
@@ -65,6 +66,7 @@ def read_decisions(root: Path) -> list[Decision]:
     Raises:
         ScenarioError: names the file and the line's candidate.
     """
+    finish_update(root)
     path = root / FOLDER / DECISIONS_FILE
     return _decisions(path, read_journal(path, SCHEMA_VERSION))
 
@@ -94,6 +96,7 @@ def record_decisions(root: Path, decisions: Iterable[Decision]) -> int:
     Returns:
         The number added.
     """
+    finish_update(root)
     path = root / FOLDER / DECISIONS_FILE
     with Journal(path, SCHEMA_VERSION) as journal:
         last = {(d.stage, d.candidate): d for d in _decisions(path, journal.records)}
@@ -110,6 +113,7 @@ def record_decisions(root: Path, decisions: Iterable[Decision]) -> int:
 
 def carry_decisions(source: Path, target: Path) -> None:
     """Copies the decisions so far into the dataset that a stage has made."""
+    finish_update(source)
     path = source / FOLDER / DECISIONS_FILE
     if path.is_file():
         with new_file(target / FOLDER / DECISIONS_FILE) as copy:

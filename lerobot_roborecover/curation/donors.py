@@ -261,6 +261,7 @@ def write_donors(
     description: str = "",
     license: str | None = None,
     on_trajectory: Callable[[int, int], None] = lambda done, total: None,
+    also: Callable[[Path], object] = lambda folder: None,
 ) -> int:
     """Replays, checks and writes the trajectories; how many were written.
 
@@ -273,6 +274,7 @@ def write_donors(
         description: free text.
         license: SPDX identifier, or None where none is decided.
         on_trajectory: told how many are done of how many.
+        also: writes further files into the folder before it appears; `funnel` is complete then.
 
     Raises:
         ScenarioError: there is nothing to write.
@@ -303,10 +305,15 @@ def write_donors(
                 yield _trajectory(donor, trial, frames)
             on_trajectory(number, len(chosen))
 
-    write_trajectories(root, "donors", trajectories(), fps=fps, description=description, license=license)
-    written = len(chosen) - dropped.total()
-    add_step(funnel, "trajectories that succeed again when replayed", written, dropped)
-    return written
+    def finish(folder: Path) -> None:
+        replayed_again = len(chosen) - dropped.total()
+        add_step(funnel, "trajectories that succeed again when replayed", replayed_again, dropped)
+        also(folder)
+
+    write_trajectories(
+        root, "donors", trajectories(), fps=fps, description=description, license=license, also=finish
+    )
+    return len(chosen) - dropped.total()
 
 
 def _job(donor: Donor, trial: PolicyTrial) -> RenderJob:

@@ -14,7 +14,7 @@ from typing import Any
 
 from lerobot_roborecover.curation.attrition import DECISIONS_FILE, carry_decisions
 from lerobot_roborecover.datasets.read import read_with_manifest
-from lerobot_roborecover.datasets.render import check_rendering, render_dataset
+from lerobot_roborecover.datasets.render import check_rendering, forget_shards, render_dataset
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
 from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.platforms import platform_named
@@ -85,7 +85,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
         for path in sorted((request.dataset / FOLDER).glob("*.json")):
             if path.name not in (MANIFEST_FILE, DECISIONS_FILE):
                 shutil.copyfile(path, folder / FOLDER / path.name)
-    shutil.rmtree(work, ignore_errors=True)
+    forget_shards(work)
     return len(scenarios)
 
 

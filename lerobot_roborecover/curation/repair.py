@@ -9,7 +9,6 @@ Nothing is taken away from the sources.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from lerobot_roborecover.datasets.load import load_scenarios
 from lerobot_roborecover.datasets.repair import Repaired, read_edited, repair
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
+from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.words import counted
 
@@ -70,9 +70,10 @@ def repair_dataset(
         kept = _decisions(root, decisions, gone)
         lines = [_decisions_line(kept, gone)]
     if not dry_run:
-        repaired = repair(root, sources)
-        if lines:
-            _write_decisions(root, kept)
+        with update_folder(root) as update:
+            repaired = repair(root, sources, update=update)
+            if lines:
+                _write_decisions(update, kept)
     return replace(repaired, lines=(*repaired.lines, *lines))
 
 
@@ -98,13 +99,17 @@ def _repair_candidates(root: Path, sets: Sequence[CandidateSet], dry_run: bool) 
         "kept elsewhere (--votes FOLDER) go by candidate id and need no repair",
     ]
     lines = [f"{CANDIDATES_FILE} and steps.parquet: {counted(len(candidates), 'candidate')}", *lines]
-    done = repair(root, [str(f) for f in folders], dry_run=dry_run)
-    if not dry_run:
-        steps = (found.steps(episode) for found, episode in origins)
-        write_candidate_metadata(root, candidates, steps, sets[0].versions)
-        _write_decisions(root, decisions)
-        write_votes(root, votes)
-        copy_examples(folders, root)
+    names = [str(f) for f in folders]
+    if dry_run:
+        done = repair(root, names, dry_run=True)
+    else:
+        with update_folder(root) as update:
+            done = repair(root, names, update=update)
+            steps = (found.steps(episode) for found, episode in origins)
+            write_candidate_metadata(update.folder, candidates, steps, sets[0].versions)
+            _write_decisions(update, decisions)
+            write_votes(root, votes, update.folder)
+            copy_examples(folders, root, update.folder)
         whole = read_candidates(root)
         for episode in range(len(whole)):
             whole.actions(episode)
@@ -165,17 +170,7 @@ def _decisions_line(decisions: Sequence[Decision], gone: set[str]) -> str:
     )
 
 
-def _write_decisions(root: Path, decisions: Sequence[Decision]) -> None:
+def _write_decisions(update: FolderUpdate, decisions: Sequence[Decision]) -> None:
     """Puts the journal in the place of what was there, which is a part of it."""
-    path = root / FOLDER / DECISIONS_FILE
-    if read_decisions(root) == list(decisions):
-        return
-    temporary = root / FOLDER / ".repair"
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        record_decisions(temporary, decisions)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if decisions:
-            os.replace(temporary / FOLDER / DECISIONS_FILE, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    if decisions and read_decisions(update.root) != list(decisions):
+        record_decisions(update.folder, decisions)

@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lerobot_roborecover.curation.split_programme import AXES, JOINT, divide_groups
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
@@ -44,6 +45,9 @@ class SplitConfig:
     least: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By split and by `cell`, `source` or `suite`: how many scenarios of each at least, where the set has as
     many. The rest is balanced as ever."""
+
+    def __post_init__(self):
+        check_seed(self.seed)
 
 
 def parse_sizes(given: Mapping[str, str]) -> dict[str, int | float]:

@@ -14,16 +14,18 @@ from lerobot_roborecover import __version__
 from lerobot_roborecover.curation.attrition import (
     Decision,
     attrition_table,
+    carry_decisions,
     count_stages,
     read_decisions,
     record_decisions,
 )
 from lerobot_roborecover.curation.split import SplitConfig, apart_for, assign, groups_of, shared
-from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.contents import list_files
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
+from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
+from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.whole import new_folder, write_whole
 from lerobot_roborecover.words import counted, next_line
@@ -65,35 +67,47 @@ def split_dataset(
         ScenarioError: the sizes are impossible, or the dataset was divided before and results may rest on
             that.
     """
+    if dry_run:
+        return _divide(root, config)
+    if out is None:
+        with update_folder(root) as update:
+            return _divide(root, config, update, force=force)
+    _divide(root, config)  # refuses before anything is copied
+    with new_folder(out) as folder:
+        _copy(root, folder)
+        with update_folder(folder) as update:
+            return _divide(folder, config, update, force=True)
+
+
+def _divide(
+    root: Path, config: SplitConfig, update: FolderUpdate | None = None, *, force: bool = False
+) -> SplitReport:
+    """Draws the splits of a dataset, and writes them where there is an update to write to."""
     scenarios, manifest = read_with_manifest(root)
     splits = assign(scenarios, config)
     divided = [replace(s, split=splits[s.id]) for s in scenarios]
     report = report_splits(divided, config.apart)
     if any(report.leaks.values()):
         raise AssertionError(f"groups were torn apart: {report.leaks}")
-    if dry_run:
+    if update is None:
         return report
-    target = root
-    before = root / FOLDER / SPLIT_FILE
     changed = [s.id for s, d in zip(scenarios, divided, strict=True) if s.split != d.split]
-    if out is None and before.is_file() and changed and not force:
+    if (root / FOLDER / SPLIT_FILE).is_file() and changed and not force:
         raise ScenarioError(
             f"{root} was divided before, and {len(changed)} scenarios would change their split, e.g. "
             f"{changed[0]!r}: results on the old test split would no longer mean the same. Write a copy with "
             "--out, or insist with --force"
         )
-    if out is not None:
-        _copy(root, out)
-        target = out
     frames = FrameStore(root)
-    write_scenarios(
-        target,
+    replace_scenarios(
+        update,
         divided,
         description=manifest.get("description", ""),
         license=manifest.get("license"),
         frames=(frames.of(s) for s in divided if s.id in frames),
     )
-    _record(target, config, report, [s.id for s in divided])
+    carry_decisions(root, update.folder)
+    _record(update.folder, config, report, [s.id for s in divided])
     return report
 
 
@@ -192,9 +206,8 @@ def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[
         record_decisions(root, (Decision(i, "split", "kept", by=f"seed {config.seed}") for i in ids))
 
 
-def _copy(root: Path, out: Path) -> None:
-    with new_folder(out) as folder:
-        for name in list_files(root):
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(root / name, target)
+def _copy(root: Path, folder: Path) -> None:
+    for name in list_files(root):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(root / name, target)

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from lerobot_roborecover.datasets.files import load_json
+from lerobot_roborecover.datasets.update import finish_update, is_update_file
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_FILES = 100_000
@@ -62,9 +63,12 @@ def list_files(root: Path) -> list[str]:
     Raises:
         ScenarioError: a link, or a file that is no part of a dataset.
     """
+    finish_update(root)
     names = []
     for folder, folders, files in os.walk(root):
-        folders[:] = sorted(d for d in folders if d not in _IGNORED)
+        ours = Path(folder) == root
+        folders[:] = sorted(d for d in folders if d not in _IGNORED and not (ours and is_update_file(d)))
+        files = [name for name in files if not (ours and is_update_file(name))]
         for name in (*folders, *files):
             path = Path(folder) / name
             if path.is_symlink():

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE, SCENARIOS_FILE
+from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_JSON_CONTAINERS = 2**22
@@ -22,8 +23,10 @@ def read_bytes(root: Path, path: Path, limit: int) -> bytes:
         limit: most bytes it may have.
 
     Raises:
-        ScenarioError: it is missing, unreadable, too large, not a regular file, or a link out of the dataset.
+        ScenarioError: it is missing, unreadable, too large, not a regular file, or a link out of the dataset;
+            or an update of the dataset was cut short and cannot be finished.
     """
+    finish_update(root)
     try:
         real = path.resolve(strict=True)
         base = root.resolve()

@@ -26,6 +26,7 @@ from lerobot_roborecover.datasets.schema import (
     MAX_MANIFEST_BYTES,
     check_frame,
 )
+from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 FRAMES_FOLDER = "frames"
@@ -109,6 +110,7 @@ class FrameStore(Mapping[str, LastFrames]):
 
     def __init__(self, root: Path | str):
         self._root = Path(root)
+        finish_update(self._root)
         self._sha256 = self._listed() if (self._root / FOLDER / FRAMES_FOLDER).exists() else {}
         self._open: tuple[str, pq.ParquetFile] | None = None
         self._places: dict[str, tuple[str, int]] = {}

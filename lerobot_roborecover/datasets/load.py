@@ -15,6 +15,7 @@ from typing import Any, overload
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
 from lerobot_roborecover.datasets.select import select_scenarios, validate_for
+from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 __all__ = ["ScenarioSet", "builtin_names", "load_scenarios", "validate_for"]
@@ -155,6 +156,8 @@ def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path,
     text = os.fspath(source)
     found = _builtin()
     builtin = sorted(found)
+    if text not in builtin:
+        finish_update(Path(text).expanduser())
     if isinstance(source, str) and text in builtin:
         if Path(text).is_dir():
             logger.warning("scenarios %r: taking the built-in set; for the folder say ./%s", text, text)

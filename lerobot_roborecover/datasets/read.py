@@ -67,6 +67,25 @@ def read_scenarios(root: str | os.PathLike[str]) -> list[Scenario]:
 
 def read_with_manifest(root: str | os.PathLike[str]) -> tuple[list[Scenario], dict[str, Any]]:
     """Reads every scenario and the manifest of a dataset folder; see `read_scenarios`."""
+    while True:
+        before = _stamp(root)
+        try:
+            return _read(root)
+        except ScenarioError:
+            if _stamp(root) == before:
+                raise  # else its files were replaced between two reads
+
+
+def _stamp(root: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """Returns what tells a manifest from one that takes its place."""
+    try:
+        found = os.stat(Path(root) / FOLDER / MANIFEST_FILE)
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
+def _read(root: str | os.PathLike[str]) -> tuple[list[Scenario], dict[str, Any]]:
     folder = Path(root) / FOLDER
     manifest = _read_manifest(Path(root))
     path = folder / SCENARIOS_FILE

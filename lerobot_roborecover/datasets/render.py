@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lerobot_roborecover.datasets.episodes import render_prefix, write_lerobot_dataset
@@ -79,6 +80,14 @@ def render_dataset(
         frames = (found for path in paths for found in FrameStore(path).values())
         write_scenarios(folder, scenarios, description=description, license=license, frames=frames)
     return root
+
+
+def forget_shards(work: Path) -> None:
+    """Removes the finished shards of `render_dataset`, and their folder where it holds nothing else."""
+    for shard in work.glob("shard-*"):
+        shutil.rmtree(shard, ignore_errors=True)
+    with suppress(OSError):
+        work.rmdir()
 
 
 def check_rendering(scenarios: Sequence[Scenario], pool: JobPool) -> None:

@@ -30,8 +30,9 @@ from lerobot_roborecover.datasets.trajectories import (
     read_trajectories,
 )
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
+from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.video_frames import check_frames
-from lerobot_roborecover.datasets.write import write_scenarios
+from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.words import counted
 
@@ -46,7 +47,13 @@ class Repaired:
     """Of the scenarios, by episode; empty for trajectories."""
 
 
-def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: bool = False) -> Repaired:
+def repair(
+    root: str | os.PathLike[str],
+    sources: Sequence[str],
+    *,
+    dry_run: bool = False,
+    update: FolderUpdate | None = None,
+) -> Repaired:
     """Rebuilds the scenarios or trajectories of a dataset from its episodes and the datasets they came from.
 
     What was known of candidates, decided and voted, `build.repair.repair_dataset` brings back on top.
@@ -55,11 +62,18 @@ def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: boo
         root: the dataset that a tool has made.
         sources: the datasets it was made from: folders, or for scenarios also Hub ids.
         dry_run: find out and check, and change nothing.
+        update: of `root`, that takes the changes; None makes one of its own.
 
     Raises:
         ScenarioError: an episode is in none of the sources, or was changed itself; nothing is changed then.
     """
     root = Path(root)
+    if update is None and not dry_run:
+        with update_folder(root) as update:
+            done = repair(root, sources, update=update)
+        if (root / FOLDER / TRAJECTORIES_FILE).is_file():
+            read_trajectories(root)
+        return done
     episodes = read_edited(root, sources)
     kinds = {(Path(s) / FOLDER / TRAJECTORIES_FILE).is_file() for s in sources}
     if len(kinds) > 1:
@@ -68,9 +82,9 @@ def repair(root: str | os.PathLike[str], sources: Sequence[str], *, dry_run: boo
         )
     if kinds.pop():
         return _repair_trajectories(
-            root, episodes, [read_trajectories(s, videos=False) for s in sources], dry_run
+            episodes, [read_trajectories(s, videos=False) for s in sources], None if dry_run else update
         )
-    return _repair_scenarios(root, episodes, sources, dry_run)
+    return _repair_scenarios(episodes, sources, None if dry_run else update)
 
 
 def read_edited(root: Path, sources: Sequence[str]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -91,7 +105,7 @@ def read_edited(root: Path, sources: Sequence[str]) -> list[tuple[np.ndarray, np
 
 
 def _repair_scenarios(
-    root: Path, episodes: Sequence[tuple[np.ndarray, np.ndarray]], sources: Sequence[str], dry_run: bool
+    episodes: Sequence[tuple[np.ndarray, np.ndarray]], sources: Sequence[str], update: FolderUpdate | None
 ) -> Repaired:
     sets = [load_scenarios(source) for source in sources]
     by_prefix: dict[str, list[tuple[int, Scenario]]] = {}
@@ -118,12 +132,12 @@ def _repair_scenarios(
         "their exact actions",
         f"scenarios.parquet: {len(chosen)} of {counted(total, 'scenario')}, in the order of the episodes",
     ]
-    if dry_run:
+    if update is None:
         return Repaired((*lines, "dry run: nothing was changed"), False, tuple(names))
-    moved = _renumber(root, list(range(len(chosen))))
+    moved = _renumber(update, list(range(len(chosen))))
     licenses = {m.get("license") for m in manifests}
-    write_scenarios(
-        root,
+    replace_scenarios(
+        update,
         chosen,
         description=" ".join(dict.fromkeys(m.get("description", "") for m in manifests)).strip(),
         license=licenses.pop() if len(licenses) == 1 else None,
@@ -143,10 +157,9 @@ def _last_frames(sources: Sequence[str], scenarios: Sequence[Scenario]) -> Itera
 
 
 def _repair_trajectories(
-    root: Path,
     episodes: Sequence[tuple[np.ndarray, np.ndarray]],
     sets: Sequence[TrajectorySet],
-    dry_run: bool,
+    update: FolderUpdate | None,
 ) -> Repaired:
     kinds = {s.kind for s in sets}
     if len(kinds) > 1:
@@ -172,21 +185,20 @@ def _repair_trajectories(
         "their exact actions",
         f"{TRAJECTORIES_FILE}: {counted(len(rows), 'trajectory')} of {counted(len(links), 'scenario')}",
     ]
-    if dry_run:
+    if update is None:
         return Repaired((*lines, "dry run: nothing was changed"), False)
-    moved = _renumber(root, [row.scenario_index for row in rows])
+    moved = _renumber(update, [row.scenario_index for row in rows])
     manifests = [s.manifest for s in sets]
     licenses = {m.get("license") for m in manifests}
     write_metadata(
-        root,
+        update.folder,
         kinds.pop(),
         list(links.values()),
         rows,
-        labels=_labels(root, list(links.values())),
+        labels=_labels(update, list(links.values())),
         description=" ".join(dict.fromkeys(m.get("description", "") for m in manifests)).strip(),
         license=licenses.pop() if len(licenses) == 1 else None,
     )
-    read_trajectories(root)
     return Repaired((*lines, f"{SCENARIO_INDEX}: {counted(moved, 'frame')} renumbered"), True)
 
 
@@ -213,50 +225,45 @@ def _only[T](number: int, matches: dict[str, T], steps: int) -> T:
     return next(iter(matches.values()))
 
 
-def _renumber(root: Path, rows: Sequence[int]) -> int:
-    """Writes each episode's new scenario row into the data; returns the number of frames that changed.
-
-    Files are rewritten beside their place and put there at the end; a stop in between leaves some renumbered,
-    and the same repair then completes it, because episodes are found by their actions first.
-    """
+def _renumber(update: FolderUpdate, rows: Sequence[int]) -> int:
+    """Writes each episode's new scenario row into the data; returns the number of frames that changed."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     from lerobot_roborecover.datasets.parquet_read import number_array, read_table
 
     changed = 0
-    staged: list[tuple[Path, Path]] = []
-    try:
-        for path in sorted((root / "data").rglob("*.parquet")):
-            table = read_table(path)
-            position = table.schema.get_field_index(SCENARIO_INDEX)
-            field = table.schema.field(position)
-            old = number_array(table[SCENARIO_INDEX]).reshape(len(table), -1)[:, 0].tolist()
-            new = [rows[e] for e in number_array(table["episode_index"]).tolist()]
-            if old == new:
-                continue
-            changed += sum(a != b for a, b in zip(old, new, strict=True))
-            nested = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
-            column = pa.array([[v] for v in new] if nested else new, field.type)
-            temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            staged.append((temporary, path))
-            pq.write_table(table.set_column(position, field, column), temporary, compression="snappy")
-        for temporary, path in staged:
-            shutil.copymode(path, temporary)
-            os.replace(temporary, path)
-    finally:
-        for temporary, _ in staged:
-            temporary.unlink(missing_ok=True)
+    for path in _data_files(update):
+        table = read_table(path)
+        position = table.schema.get_field_index(SCENARIO_INDEX)
+        field = table.schema.field(position)
+        old = number_array(table[SCENARIO_INDEX]).reshape(len(table), -1)[:, 0].tolist()
+        new = [rows[e] for e in number_array(table["episode_index"]).tolist()]
+        if old == new:
+            continue
+        changed += sum(a != b for a, b in zip(old, new, strict=True))
+        nested = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
+        column = pa.array([[v] for v in new] if nested else new, field.type)
+        target = update.folder / path.relative_to(update.root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table.set_column(position, field, column), target, compression="snappy")
+        shutil.copymode(path, target)
     return changed
 
 
-def _labels(root: Path, links: Sequence[ScenarioLink]) -> dict[tuple[str, int], int]:
+def _data_files(update: FolderUpdate) -> list[Path]:
+    """Returns the data files that the dataset will have, those of the update in the place of its own."""
+    names = [p.relative_to(update.root).as_posix() for p in sorted((update.root / "data").rglob("*.parquet"))]
+    return [update.path(name) for name in names]
+
+
+def _labels(update: FolderUpdate, links: Sequence[ScenarioLink]) -> dict[tuple[str, int], int]:
     """Frames by split and label, where the data is of a monitor."""
     from lerobot_roborecover.datasets.parquet_read import column_names, read_numbers
     from lerobot_roborecover.datasets.trajectories import LABEL
 
     counts: dict[tuple[str, int], int] = {}
-    for path in sorted((root / "data").rglob("*.parquet")):
+    for path in _data_files(update):
         if LABEL not in column_names(path):
             continue
         table = read_numbers(path, [LABEL, SCENARIO_INDEX])

@@ -30,6 +30,7 @@ from lerobot_roborecover.datasets.schema import (
     package_versions,
     to_row,
 )
+from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.whole import forget_stale, new_file, new_folder, write_whole
 
@@ -49,8 +50,7 @@ def write_scenarios(
 ) -> Path:
     """Writes `meta/roborecover/scenarios.parquet` and `manifest.json` below a dataset's root.
 
-    Each file is written under a temporary name and then put in place, the manifest last: a reader sees the
-    old set, the new set, or a refusal, never a mixture.
+    A reader sees the old set or the new set, never a mixture (`update.update_folder`).
 
     Args:
         root: the dataset's folder; made if missing, and replaced set by set if there already is one.
@@ -73,11 +73,29 @@ def write_scenarios(
     scenarios = list(scenarios)
     check_set(scenarios)
     root = Path(root)
-    if episodes is None:
+    if episodes is None and not (root / FOLDER).exists():
         _write_folder(root / FOLDER, scenarios, description, license, frames)
+    elif episodes is None:
+        with update_folder(root) as update:
+            replace_scenarios(update, scenarios, description=description, license=license, frames=frames)
     else:
         _write_dataset(root, scenarios, description, license, episodes, fps, frames)
     return root
+
+
+def replace_scenarios(
+    update: FolderUpdate,
+    scenarios: Iterable[Scenario],
+    *,
+    description: str = "",
+    license: str | None = None,
+    frames: Iterable[LastFrames] = (),
+) -> None:
+    """Writes scenarios in the place of a dataset's, as a part of an update; see `write_scenarios`."""
+    scenarios = list(scenarios)
+    check_set(scenarios)
+    _write_folder(update.folder / FOLDER, scenarios, description, license, frames)
+    update.replace_folder(f"{FOLDER}/{FRAMES_FOLDER}")
 
 
 def _write_folder(

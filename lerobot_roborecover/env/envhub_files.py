@@ -8,6 +8,7 @@ from lerobot_roborecover.datasets.card import render_card, render_text
 from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
 from lerobot_roborecover.env.envhub import HubScenarios
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.outputs import check_page
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.whole import write_whole
 
@@ -23,6 +24,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
 
     Raises:
         OptionError: the id is none, or the set is a folder, which nobody else has.
+        OutputExistsError: `out` holds an `env.py` or a card that this command did not write.
     """
     if not HUB_ID.fullmatch(repo_id):
         raise OptionError(f"--repo-id {repo_id!r:.120}: write it like org/name")
@@ -51,6 +53,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         **values,
     )
     texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}
+    check_page(out, list(texts), lambda page: b"Made by `roborecover envhub`" in page.read_bytes())
     for name, text in texts.items():
         write_whole(out / name, text)
     return [out / name for name in texts]

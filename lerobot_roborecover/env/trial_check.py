@@ -403,9 +403,20 @@ def _check_together(record: Mapping[str, Any]) -> None:
         raise FieldProblem(
             f"field 'success': success is {success!r} but the outcome is {outcome!r}. {_REMEDY}"
         )
+    if outcome == Outcome.HORIZON and steps < horizon:
+        raise _refuse("steps", steps, f"but the outcome is 'horizon', after all of {horizon} steps")
     if steps > horizon and not (record["interventions"] and not Outcome(outcome).valid):
         # A trial that broke while it ran on after a rollback has taken more; its outcome is invalid.
         raise _refuse("steps", steps, f"more than the horizon of {horizon} steps")
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise FieldProblem(f"field {_shown(twice)} occurs twice. {_REMEDY}")
+    return found
 
 
 def parse_json(line: bytes) -> object:
@@ -415,7 +426,9 @@ def parse_json(line: bytes) -> object:
         FieldProblem: it is not JSON in UTF-8, or is nested without end.
     """
     try:
-        return json.loads(line.decode("utf-8"))
+        return json.loads(line.decode("utf-8"), object_pairs_hook=_without_duplicates)
+    except FieldProblem:
+        raise
     except RecursionError:
         raise FieldProblem(f"not a JSON trial row (nested too deeply). {_REMEDY}") from None
     except UnicodeDecodeError as err:

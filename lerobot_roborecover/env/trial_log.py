@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import json
-import os
 import re
 import sys
 import typing
@@ -19,13 +18,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
+from unicodedata import normalize
 
+from lerobot_roborecover.env.log_file import LogFileError, LogTextError, appendable, open_log
 from lerobot_roborecover.env.trial_check import MAX_LINE_BYTES, FieldProblem, RowChecker, parse_json
 from lerobot_roborecover.env.trial_row import Protocol, TrialRow, row_of
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.journal import AppendOnly, InUseError, append_records, complete_lines
 from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.whole import write_whole
 
 
 class TrialLogError(RoboRecoverError, ValueError):
@@ -94,19 +94,19 @@ def read_log(path: Path, policy: str | None = None) -> ReadLog:
         TrialLogError: the file cannot be read as a trial log; names the line and the field.
     """
     try:
-        with open(path, "rb") as file, _collector_paused():
+        with open_log(Path(path)) as log, _collector_paused():
             policies: dict[str, None] = {}
             lines: list[int] = []
             rows: list[TrialRow] = []
-            for line, row in _checked_rows(complete_lines(file, MAX_LINE_BYTES), str(path)):
-                policies[row.policy] = None
-                if policy is not None:
-                    object.__setattr__(row, "policy", policy)  # nobody has seen the row yet
+            for line, row in _checked_rows(complete_lines(log.file, MAX_LINE_BYTES), str(path)):
+                policies[normalize("NFC", row.policy)] = None
+                # Nobody has seen the row yet. Canonically equal names are one name.
+                object.__setattr__(row, "policy", normalize("NFC", row.policy if policy is None else policy))
                 lines.append(line)
                 rows.append(row)
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - 1, 0))
-            cut = file.read(1) not in (b"\n", b"")
+            cut = log.cut
+    except LogTextError as err:
+        raise TrialLogError(f"{path}, line 1: {err}") from None
     except (OSError, ValueError) as err:  # ValueError: a path with a NUL
         if isinstance(err, TrialLogError):
             raise
@@ -209,7 +209,12 @@ class TrialLog:
     def __init__(self, path: Path):
         self.path = Path(path)
         try:
+            appendable(self.path)
             self._file = AppendOnly(self.path)
+        except LogTextError as err:
+            raise TrialLogError(f"{path}, line 1: {err}") from None
+        except LogFileError as err:
+            raise TrialLogError(f"cannot add to trial log {path}: {err}") from None
         except InUseError:
             raise TrialLogError(
                 f"trial log {path} is in use by another process. Wait for it, or give this run a "
@@ -294,9 +299,7 @@ class TrialLog:
             out = {r.key() for r in gone}
             kept = [r for r in rows if r.key() not in out]
             append_records(to, *map(asdict, gone))
-            self._file.close()
-            write_whole(self.path, "".join(json.dumps(asdict(r), allow_nan=False) + "\n" for r in kept))
-            self._file = AppendOnly(self.path)
+            self._file.replace(json.dumps(asdict(r), allow_nan=False).encode() for r in kept)
             for key in out:
                 del self._done[key]
         return len(gone)

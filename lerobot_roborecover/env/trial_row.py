@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any
+from unicodedata import normalize
 
 from lerobot_roborecover.env.trial_check import MAX_TEXT, TRIAL_SCHEMA
 from lerobot_roborecover.platforms import platform_named
@@ -36,6 +37,10 @@ class Protocol:
     """What else decides a result: observation size, control mode, handoff check, and the like."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Packages that decide scores."""
+
+    def __post_init__(self):
+        # A path with a decomposed letter, as some file systems give it, is the same policy.
+        object.__setattr__(self, "policy", normalize("NFC", self.policy))
 
     def rewind_for(self, scenario: TrialStart) -> int:
         """Steps before the recovery point on this scenario, before the task's start limits them."""

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.errors import RoboRecoverError, check_seed
 from lerobot_roborecover.platforms import Platform, Simulator, platform_named
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.probe import answer, last_answer
@@ -51,6 +51,9 @@ class CheckRequest:
     """Random actions of a run."""
     seed: int = 0
     """Of the actions."""
+
+    def __post_init__(self):
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,14 @@ from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_markdown
 from lerobot_roborecover.env.render_device import egl_devices
-from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, ArmResult, ReproductionResult
+from lerobot_roborecover.outputs import check_page
+from lerobot_roborecover.reproduce.arms import (
+    INITIAL,
+    RECOVERY,
+    ArmResult,
+    ReproductionPlan,
+    ReproductionResult,
+)
 from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.workers.capacity import usable_cores
 
@@ -26,9 +33,26 @@ MARKDOWN, JSON = "reproduction.md", "reproduction.json"
 def write_record(result: ReproductionResult) -> tuple[Path, Path]:
     """Writes both files into the plan's folder; returns their paths."""
     out = result.plan.out
-    write_whole(out / MARKDOWN, page(result))
+    check_record(result.plan)
     write_whole(out / JSON, json.dumps(_plain(record(result)), indent=1, ensure_ascii=False) + "\n")
+    write_whole(out / MARKDOWN, page(result))
     return out / MARKDOWN, out / JSON
+
+
+def check_record(plan: ReproductionPlan) -> None:
+    """Checks that the plan's folder holds no record of another reproduction.
+
+    Raises:
+        OutputExistsError: it does.
+    """
+
+    def made_here(path: Path) -> bool:
+        try:
+            return json.loads(path.read_bytes())["name"] == plan.checkpoint.name
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return False
+
+    check_page(plan.out, (JSON, MARKDOWN), made_here)
 
 
 def verdict(result: ReproductionResult) -> str:

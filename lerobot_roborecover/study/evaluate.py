@@ -28,6 +28,7 @@ from lerobot_roborecover.study.outcomes import (
 )
 from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
 from lerobot_roborecover.trials.sizes import SLOT_GB
+from lerobot_roborecover.whole import write_whole
 from lerobot_roborecover.words import output_end
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
@@ -90,7 +91,7 @@ def evaluate(
         if not _finished(arm, ids):
             claim_log(arm.log, _identity(arm), say)
             run_arm(arm, study)
-            (arm.out / DONE_FILE).write_text(_what_ran(arm, ids))
+            write_whole(arm.out / DONE_FILE, _what_ran(arm, ids))
         return time.monotonic() - began
 
     with ThreadPoolExecutor(jobs) as pool:

@@ -23,7 +23,7 @@ from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
 from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
 from lerobot_roborecover.study.stages import CHECKPOINT, stages
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.whole import new_folder, write_whole
 
 
 def make(
@@ -74,7 +74,7 @@ def chain_for(out: Path, recipe: StudyRecipe) -> ChainConfig:
     """The scenarios' recipe, written anew so that it works below `out`."""
     out.mkdir(parents=True, exist_ok=True)
     chain = Path(recipe.chain)
-    (out / chain.name).write_text(chain.read_text().replace(recipe.chain_root, str(out)))
+    write_whole(out / chain.name, chain.read_text().replace(recipe.chain_root, str(out)))
     return read_config(out / chain.name)
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from lerobot_roborecover.analysis.intervals import rate_interval, spread
 from lerobot_roborecover.env.run import group_name
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.outputs import OutputExistsError
 
 
 def eval_info(
@@ -54,6 +57,29 @@ def eval_info(
         "per_group": {group: aggregate(scenarios) for group, scenarios in groups.items()},
         "overall": aggregate([trials for scenarios in groups.values() for trials in scenarios]),
     }
+
+
+def check_eval_info(path: Path, log: Path) -> None:
+    """Checks that a run whose log has no trial of it yet replaces no other run's results.
+
+    Args:
+        path: `eval_info.json` that the run will write.
+        log: the run's trial log.
+
+    Raises:
+        OutputExistsError: the file holds episodes, or is something else.
+    """
+    if not path.exists() and not path.is_symlink():
+        return
+    try:
+        empty = not json.loads(path.read_bytes())["per_task"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        empty = False
+    if not empty:
+        raise OutputExistsError(
+            f"{path} holds the results of another run: {log} has no trial of this one. Name another "
+            "--output_dir, or move the file away"
+        )
 
 
 def success_counts(scenarios: list[list[float]]) -> dict:

@@ -12,6 +12,7 @@ from lerobot_roborecover.analysis.extent import missing
 from lerobot_roborecover.analysis.sequential_record import record_path
 from lerobot_roborecover.env.trial_log import TrialLogError, read_log
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.outputs import OutputExistsError, check_new_file
 from lerobot_roborecover.whole import new_file
 
 
@@ -92,18 +93,26 @@ class Merged:
     """What was left out, and why; and what is missing."""
 
 
-def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False) -> Merged:
+def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False, force: bool = False) -> Merged:
     """Writes one log with the rows of many, ordered by scenario, start and trial.
 
     Args:
         logs: trial logs, of shards or of interrupted runs.
-        out: where to write; replaced as a whole.
+        out: the merged log.
         unequal: accept scenarios with different numbers of trials.
+        force: replace a file that exists at `out`; a log that was merged, or is in use, is never replaced.
 
     Raises:
         TrialLogError: a log is damaged, the protocols differ, two rows disagree about one trial, or the trial
             counts are unequal.
+        OutputExistsError, InUseError: `out` exists and is not replaced.
     """
+    check_new_file(out, force=force, inputs=logs)
+    if record_path(out).exists():
+        raise OutputExistsError(
+            f"{record_path(out)} says how another run was watched and would be read as the merged log's. "
+            "Name another file, or move that record away"
+        )
     found: dict[tuple, tuple[TrialRow, str]] = {}
     remarks: list[str] = []
     for path in logs:

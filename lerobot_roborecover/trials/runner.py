@@ -26,11 +26,12 @@ from lerobot_roborecover.env.options import OptionError
 from lerobot_roborecover.env.run import Run, open_run
 from lerobot_roborecover.env.trial_log import check_retry
 from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.policy_thread import CallStoppedError
 from lerobot_roborecover.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.eval_info import eval_info
+from lerobot_roborecover.trials.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.trials.load import HostSpec, load_host
 from lerobot_roborecover.trials.places import EnginePlaces, open_engine
 from lerobot_roborecover.trials.progress import ProgressLine, Tally
@@ -195,6 +196,7 @@ class Stopper:
 def evaluate(cfg: RecoveryEvalConfig) -> int:
     """Runs the evaluation that a command line asks for; see `main`."""
     cfg.runner.check()
+    check_seed(cfg.seed)
     env, policy = cfg.recovery_env, cfg.given_policy
     if cfg.eval.recording:
         raise OptionError(
@@ -212,6 +214,8 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
     scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
+    if not run.rows():
+        check_eval_info(out / "eval_info.json", log.path)
     if cfg.runner.retried:
         again, beside = run.retry(cfg.runner.retried)
         print(f"{counted(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)

@@ -152,7 +152,7 @@ def test_reversion_by_the_papers_rule_is_one_arm(tmp_path):
     assert len(merge([tmp_path / "rule.jsonl"], tmp_path / "merged.jsonl").rows) == 8
     told = write_log(tmp_path / "told.jsonl", [replace(r, trial=9, options={}) for r in rows[:1]])
     with pytest.raises(TrialLogError, match=r"rewind_steps is None .* 30"):
-        merge([tmp_path / "rule.jsonl", told], tmp_path / "merged.jsonl")
+        merge([tmp_path / "rule.jsonl", told], tmp_path / "other.jsonl")
 
 
 def test_command(tmp_path, capsys):

@@ -42,7 +42,7 @@ from tests.support.trial_rows import trial_row, write_log
 
 
 def scenarios():
-    return [replace(fake_scenario(i, horizon=60), split="train") for i in range(4)]
+    return [replace(fake_scenario(i, horizon=60 if i else 12), split="train") for i in range(4)]
 
 
 def driven(scenario, prefix: int | None = None, limit: int = 60) -> tuple[np.ndarray, bool]:
@@ -60,7 +60,8 @@ def driven(scenario, prefix: int | None = None, limit: int = 60) -> tuple[np.nda
 
 def row_of(scenario, actions, success, trial=0, **changes):
     values = {
-        "scenario_sha256": scenario.sha256(), "platform": "fake", "steps": len(actions), "horizon": 60,
+        "scenario_sha256": scenario.sha256(), "platform": "fake", "steps": len(actions),
+        "horizon": scenario.task.horizon,
         "actions_sha256": actions_digest(actions), "handoff_step": len(scenario.prefix),
         "suite": scenario.task.suite, "task": scenario.task.name,
     }  # fmt: skip
@@ -69,11 +70,11 @@ def row_of(scenario, actions, success, trial=0, **changes):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Four trials: plain ones, one with a takeover in its middle, one that is broken off before the end."""
+    """Four trials: plain ones, one with a takeover in its middle, one that ends by its horizon."""
     folder = tmp_path_factory.mktemp("trials")
     rows = []
     for number, scenario in enumerate(scenarios()):
-        actions, success = driven(scenario, limit=60 if number else 12)
+        actions, success = driven(scenario, limit=scenario.task.horizon)
         took = {"kind": "takeover", "step": 3, "by": "schedule", "steps": 4}
         rows.append(row_of(scenario, actions, success, interventions=[took] if number == 1 else []))
         (folder / ACTIONS_FOLDER).mkdir(exist_ok=True)

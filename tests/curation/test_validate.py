@@ -244,6 +244,7 @@ def validated(tmp_path_factory):
         if row["scenario_id"] == good[2].id:
             success = not row["success"]
             row |= {"success": success, "outcome": "success" if success else "horizon"}
+            row["steps"] = row["steps"] if success else row["horizon"]
     log.write_text("".join(json.dumps(row) + "\n" for row in rows))
     argv = ["validate", str(root / "set"), "--trials-folder", str(root / "trials"), "--workers", "2"]
     argv += ["--runs", "5"]

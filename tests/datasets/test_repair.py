@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from dataclasses import replace
@@ -16,6 +17,7 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.repair import repair
 from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import write_trajectories
+from lerobot_roborecover.datasets.update import PENDING
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.words import counted
@@ -102,6 +104,37 @@ def test_tools_of_lerobot_lose_our_metadata_and_repair_brings_it_back(
     assert main(arguments) == 0
     assert "0 frames renumbered" in capsys.readouterr().out
     assert files_of(root) == before
+
+
+def test_a_repair_that_is_cut_short_is_finished_by_the_next_command(sources, tmp_path, monkeypatch):
+    """Data and metadata change at one moment: before it nothing has, after it a reader finds all."""
+    root, replace_file = tmp_path / "set", os.replace
+    shutil.copytree(sources / "merged", root)
+    before, left = files_of(root), 0
+
+    def cut_short(source, target):
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        replace_file(source, target)
+
+    for operations in range(50):
+        left = operations
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "replace", cut_short)
+            try:
+                repair(root, [str(sources / "a"), str(sources / "b")])
+                break
+            except KeyboardInterrupt:
+                pass
+        if not (root / PENDING).exists():
+            assert files_of(root) == before
+        else:
+            check(root, [4, 5, 6, 0, 1, 2, 3])
+            shutil.rmtree(root)
+            shutil.copytree(sources / "merged", root)
+    assert operations > 4
 
 
 def test_an_episode_of_no_source_is_refused_and_nothing_is_changed(sources, tmp_path):

@@ -60,7 +60,8 @@ for index, scenario in enumerate(load_scenarios(given["env.scenarios"], select=g
         row = make_row(
             scenario, protocol, dataset="x", dataset_revision=None, trial=trial, batch_size=1,
             noise="per_trial", outcome=Outcome.SUCCESS if solved else Outcome.HORIZON, reason="",
-            steps=7, handoff=None, sim_s=0.0, policy_s=0.0, actions_sha256="",
+            steps=7 if solved else scenario.task.horizon, handoff=None, sim_s=0.0, policy_s=0.0,
+            actions_sha256="",
         )
         if log.find(row.key()):
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -19,10 +20,11 @@ PROTOCOL = Protocol("recovery", 0, "push@1", 1000, 10)
 
 
 def row(trial: int, outcome: Outcome = Outcome.SUCCESS, protocol: Protocol = PROTOCOL):
+    steps = fake_scenario(0).task.horizon if outcome is Outcome.HORIZON else 7
     return make_row(
         fake_scenario(0), protocol, dataset="d", dataset_revision=None, trial=trial,
         noise="per_trial", batch_size=1,
-        outcome=outcome, reason="", steps=7, handoff=None, sim_s=0.1, policy_s=0.2, actions_sha256="",
+        outcome=outcome, reason="", steps=steps, handoff=None, sim_s=0.1, policy_s=0.2, actions_sha256="",
     )  # fmt: skip
 
 
@@ -77,6 +79,27 @@ def test_a_log_in_use_is_refused(tmp_path):
         TrialLog(tmp_path / "log.jsonl")
     log.close()
     TrialLog(tmp_path / "log.jsonl").close()
+
+
+def test_a_log_is_never_without_its_lock_while_rows_are_set_aside(tmp_path, monkeypatch):
+    log, replace, tried = TrialLog(tmp_path / "log.jsonl"), os.replace, []
+
+    def another_process_tries(*args):
+        for _ in range(2):
+            with pytest.raises(TrialLogError, match="in use by another process"):
+                TrialLog(log.path)
+            tried.append(args)
+            if len(tried) == 1:
+                replace(*args)
+
+    for trial, outcome in enumerate((Outcome.SUCCESS, Outcome.TIMEOUT)):
+        log.append(row(trial, outcome))
+    monkeypatch.setattr(os, "replace", another_process_tries)
+    assert log.set_aside(["timeout"], tmp_path / "retried.jsonl") == 1
+    assert len(tried) == 2
+    log.append(row(1))
+    log.close()
+    assert [r.outcome for r in read_trial_log(log.path)] == ["success", "success"]
 
 
 def test_a_future_schema_and_unknown_fields_are_refused(tmp_path):

@@ -29,6 +29,8 @@ def trial_row(scenario: int | str, trial: int = 0, success: bool = True, **chang
     outcome = changes.pop("outcome", "success" if success else "horizon")
     start = changes.get("start", "recovery")
     policy = changes.get("policy", "alpha@1")
+    horizon = changes.get("horizon", 300)
+    steps = horizon if outcome == "horizon" else min(100, horizon)
     values = {
         "schema": TRIAL_SCHEMA, "scenario_id": name, "scenario_sha256": f"{index:064x}", "dataset": "made-up",
         "dataset_revision": "r1", "platform": "libero", "suite": ("libero_goal", "libero_10")[index % 2],
@@ -37,7 +39,7 @@ def trial_row(scenario: int | str, trial: int = 0, success: bool = True, **chang
         "source_policy": ("alpha", "beta")[index % 2], "cluster": "", "split": "test", "start": start,
         "rewind_steps": 0, "handoff_step": 40, "trial": trial, "run_seed": 1000, "trial_seed": trial,
         "noise": "per_trial", "batch_size": 1, "outcome": outcome, "success": outcome == "success",
-        "reason": "" if outcome in ("success", "horizon") else "made up", "steps": 100, "horizon": 300,
+        "reason": "" if outcome in ("success", "horizon") else "made up", "steps": steps, "horizon": horizon,
         "handoff_eef_error_mm": 0.0, "handoff_object_error_mm": 0.0, "handoff_identical": True,
         "handoff_from_snapshot": True, "handoff_s": 0.1, "sim_s": 1.0, "policy_s": 1.0, "actions_sha256": "",
         "interventions": [], "options": {"obs_type": "pixels"}, "policy": policy, "execution_horizon": 10,

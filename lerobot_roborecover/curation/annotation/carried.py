@@ -12,9 +12,10 @@ from lerobot_roborecover.curation.annotation.examples import EXAMPLES_FOLDER
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
 from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER, ballot
 from lerobot_roborecover.datasets.schema import FOLDER
-from lerobot_roborecover.journal import Journal, read_journal
+from lerobot_roborecover.errors import InUseError
+from lerobot_roborecover.journal import read_journal
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.whole import check_unlocked, write_whole
 
 
 def gather_votes(sources: Sequence[Path], root: Path, there: set[str]) -> dict[str, list[dict[str, Any]]]:
@@ -65,24 +66,41 @@ def _by_candidate(path: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def write_votes(root: Path, votes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
+def write_votes(
+    root: Path, votes: Mapping[str, Sequence[Mapping[str, Any]]], folder: Path | None = None
+) -> None:
     """Writes every annotator's records, unless the dataset has just these.
+
+    Args:
+        root: the dataset.
+        votes: records by annotator.
+        folder: of an update of the dataset, which takes the files; None writes to `root`.
 
     Raises:
         ScenarioError: an annotator is at work on them.
     """
     for name, records in votes.items():
-        path = root / FOLDER / VOTES_FOLDER / f"{name}.jsonl"
-        with Journal(path, VOTES_SCHEMA) as journal:  # refuses where an annotator is at work
-            if journal.records != list(records):
-                write_whole(path, "".join(json.dumps(r) + "\n" for r in records))
+        path = f"{FOLDER}/{VOTES_FOLDER}/{name}.jsonl"
+        try:
+            check_unlocked(root / path)
+        except InUseError as err:
+            raise ScenarioError(str(err)) from None
+        if read_journal(root / path, VOTES_SCHEMA) != list(records):
+            write_whole((folder or root) / path, "".join(json.dumps(r) + "\n" for r in records))
 
 
-def copy_examples(folders: Sequence[Path], root: Path) -> None:
-    """Pictures for the annotators' guide, the first source's where several have one of a name."""
-    for folder in folders:
-        for path in sorted((folder / FOLDER / EXAMPLES_FOLDER).glob("*")):
-            target = root / FOLDER / EXAMPLES_FOLDER / path.name
-            if path.is_file() and not target.exists():
+def copy_examples(folders: Sequence[Path], root: Path, folder: Path | None = None) -> None:
+    """Copies pictures for the annotators' guide, the first source's where several have one of a name.
+
+    Args:
+        folders: the sources.
+        root: the dataset that has none of a name yet.
+        folder: of an update of the dataset, which takes the files; None writes to `root`.
+    """
+    for source in folders:
+        for path in sorted((source / FOLDER / EXAMPLES_FOLDER).glob("*")):
+            name = f"{FOLDER}/{EXAMPLES_FOLDER}/{path.name}"
+            target = (folder or root) / name
+            if path.is_file() and not (root / name).exists() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)

@@ -14,6 +14,7 @@ from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.datasets.files import load_json, read_bytes
+from lerobot_roborecover.outputs import check_new_file
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.whole import write_whole
 
@@ -47,13 +48,26 @@ class Discussion:
         )
 
     def write(self, path: Path) -> None:
-        """Writes the list, whole or not at all."""
+        """Writes the list, whole or not at all; an earlier list is replaced.
+
+        Raises:
+            OutputExistsError: `path` is something else than a list.
+        """
+        check_new_file(path, force=_is_discussion(path))
         document = {
             "schema": SCHEMA_VERSION,
             "round": self.round,
             "candidates": [{"id": name, **about} for name, about in self.candidates.items()],
         }
         write_whole(path, json.dumps(document, indent=1) + "\n")
+
+
+def _is_discussion(path: Path) -> bool:
+    try:
+        read_discussion(path)
+    except ScenarioError:
+        return False
+    return True
 
 
 def read_discussion(path: Path) -> Discussion:

@@ -25,6 +25,7 @@ from lerobot_roborecover.curation.detection.scoring import PolicyLooks, cost_ms,
 from lerobot_roborecover.curation.detection.trials import SeenTrial, TrialSource, see_trials
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.interventions.detectors.base import DetectorRewardModel
 from lerobot_roborecover.interventions.detectors.interface import Detector, MonitorDetector
 from lerobot_roborecover.interventions.detectors.loading import (
@@ -73,6 +74,9 @@ class DetectionRequest:
     """Of the halves of the scenarios."""
     against: Sequence[str] = ()
     """Names of detectors; pairs without one of them are not tested. Empty: all pairs are."""
+
+    def __post_init__(self):
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
 from lerobot_roborecover.datasets.trajectory_write import split_by_scenario
+from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
 
 TRAIN, BALANCED, NATURAL = "train", "validation_balanced", "validation_natural"
@@ -61,6 +62,7 @@ class DataOptions:
     """Of the split and of the choice of frames."""
 
     def __post_init__(self):
+        check_seed(self.seed)
         if self.split_by not in ("scenario", "cluster"):
             raise ScenarioError(f"split by {self.split_by!r}: must be scenario or cluster")
         if self.every < 1 or self.validation <= 0:

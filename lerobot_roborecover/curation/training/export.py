@@ -62,6 +62,7 @@ def export_training(
     description: str = "",
     license: str | None = None,
     on_episode: Callable[[int, int], None] = lambda done, total: None,
+    also: Callable[[Path], object] = lambda folder: None,
 ) -> Exported:
     """Replays and writes the episodes; the dataset appears as a whole, or not at all.
 
@@ -74,6 +75,7 @@ def export_training(
         description: free text.
         license: SPDX identifier, or None where none is decided.
         on_episode: told how many are done of how many.
+        also: writes further files into the folder before it appears.
 
     Raises:
         ScenarioError: there is nothing to write.
@@ -112,10 +114,13 @@ def export_training(
                 )
             on_episode(number, len(lines))
 
+    def finish(folder: Path) -> None:
+        write_whole(folder / PROGRESS_FILE, progress_parquet(told))
+        also(folder)
+
     write_trajectories(
-        out, "training", trajectories(), fps=fps, description=description, license=license,
-        also=lambda folder: write_whole(folder / PROGRESS_FILE, progress_parquet(told)),
-    )  # fmt: skip
+        out, "training", trajectories(), fps=fps, description=description, license=license, also=finish
+    )
     return Exported(
         len(told),
         sum(len(t[DONE]) for t in told),
