@@ -59,7 +59,8 @@ def driven(scenario, prefix: int | None = None, limit: int = 60) -> tuple[np.nda
 
 def row_of(scenario, actions, success, trial=0, **changes):
     values = {
-        "scenario_sha256": scenario.sha256(), "platform": "fake", "steps": len(actions), "horizon": scenario.task.horizon,
+        "scenario_sha256": scenario.sha256(), "platform": "fake", "steps": len(actions),
+        "horizon": scenario.task.horizon,
         "actions_sha256": actions_digest(actions), "handoff_step": len(scenario.prefix),
         "suite": scenario.task.suite, "task": scenario.task.name,
     }  # fmt: skip
