@@ -109,7 +109,8 @@ def rows_of(dataset, outcomes: dict[str, list[str]], start: str = "recovery", **
                 scenarios[scenario], protocol, dataset="x", dataset_revision=None, trial=k, batch_size=1,
                 noise="per_trial", outcome=Outcome(outcome),
                 reason="the <worker> died" if outcome == "sim_error" else "",
-                steps=9, handoff=None, sim_s=0.0, policy_s=0.0, actions_sha256="",
+                steps=scenarios[scenario].task.horizon if outcome == "horizon" else 9,
+                handoff=None, sim_s=0.0, policy_s=0.0, actions_sha256="",
             )
         )
         | more

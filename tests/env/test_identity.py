@@ -185,7 +185,7 @@ def test_only_the_kind_of_device_counts(mine, key):
         {"scenario": lambda s: replace(s, task=replace(s.task, horizon=11))},
         {"scenario": lambda s: replace(s, prefix=s.prefix + 1e-9)},
     ],
-    ids=str,
+    ids=lambda change: next(iter(change)),
 )  # fmt: skip
 def test_what_else_decides_a_result_counts(mine, key, change):
     if "scenario" in change:
