@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lerobot_roborecover.analysis.contrasts import Contrast
 from lerobot_roborecover.analysis.detection import (
     DEVIATED,
@@ -25,6 +23,7 @@ from lerobot_roborecover.analysis.detection_figures import (
     finite,
     strip_figure,
 )
+from lerobot_roborecover.analysis.detection_scores import write_scores
 from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
@@ -33,7 +32,8 @@ from lerobot_roborecover.outputs import claim_page
 from lerobot_roborecover.whole import write_whole
 
 SCHEMA_VERSION = 1
-DETECTION_FILES = ("detectors.html", "detectors.md", "detectors.json", "tables", "scores")
+NUMBERS_FILE, SCORES_FOLDER = "detectors.json", "scores"
+DETECTION_FILES = ("detectors.html", "detectors.md", NUMBERS_FILE, "tables", SCORES_FOLDER)
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,7 @@ def write_detection_report(
     seed: int,
     about: Mapping[str, Any],
     pairs: Sequence[Contrast] = (),
+    against: Sequence[str] = (),
 ) -> Path:
     """Writes everything.
 
@@ -168,6 +169,7 @@ def write_detection_report(
         seed: of the halves of the scenarios.
         about: what was measured: policy, scenarios, command, versions.
         pairs: of detectors, tested.
+        against: names of the detectors that pairs were limited to.
 
     Returns:
         The page.
@@ -185,16 +187,18 @@ def write_detection_report(
         write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
         write_whole(out / f"{figure.name}.png", png_of(figure.plot))
     for name, trials in scored.items():
-        _write_scores(out / "scores" / f"{name}.npz", trials)
+        write_scores(out / SCORES_FOLDER / f"{name}.npz", trials)
     numbers = {
         "schema_version": SCHEMA_VERSION,
         "about": dict(about),
         "alpha": alpha,
         "level": level,
+        "seed": seed,
+        "against": list(against),
         "detectors": {m.name: detector_json(m) for m in measured},
         "pairs": [_pair_json(c) for c in pairs],
     }
-    write_whole(out / "detectors.json", json.dumps(numbers, indent=1, default=str) + "\n")
+    write_whole(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
     page = render_page(
         "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
         pictures=_pictures(figures), films=_pictures(films),
@@ -282,19 +286,3 @@ def _plain(value: float) -> float | None:
 
 def _pictures(figures: Sequence[Figure]) -> list[dict[str, str]]:
     return [picture(figure) for figure in figures]
-
-
-def _write_scores(path: Path, trials: Sequence[ScoredTrial]) -> None:
-    """Every score, for whoever wants to look otherwise."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lengths = [len(t.scores) for t in trials]
-    np.savez_compressed(
-        path,
-        scenario=np.array([t.scenario for t in trials]),
-        start=np.array([t.start for t in trials]),
-        trial=np.array([t.trial for t in trials]),
-        success=np.array([t.success for t in trials]),
-        handoff=np.array([t.handoff for t in trials]),
-        length=np.array(lengths),
-        score=np.concatenate([t.scores for t in trials]),
-    )

@@ -48,6 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "chunk_disagreement, constant, elapsed, no_progress, oracle, policy_features, recovery_gain, "
         "state_distance; may be given again",
     )  # fmt: skip
+    add(
+        "--scores", type=Path, metavar="DIR",
+        help="run nothing: report the scores in the --out of an earlier comparison",
+    )  # fmt: skip
     add("--scenarios", help="scenario set: folder, Hub id or shipped name")
     add("--policy", metavar="CHECKPOINT", help="who acts in the trials, and is watched")
     add("--scenarios-revision", metavar="REVISION", help="commit, tag or branch of the set on the Hub")
@@ -90,6 +94,14 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.interventions.monitor.errors import MonitorError
 
     frames, side = ("monitor", "data"), ("detector", "scenarios", "policy")
+    if args.scores:
+        clash = [name for name in (*frames, *side) if getattr(args, name)]
+        if clash:
+            raise MonitorError(
+                f"--{clash[0]} does not belong to --scores, which reports a finished comparison. Leave "
+                "out one"
+            )
+        return _from_scores(args)
     wanted, others = (side, frames) if args.detector else (frames, side)
     missing = [name for name in wanted if not getattr(args, name)]
     clash = [name for name in others if getattr(args, name)]
@@ -160,7 +172,7 @@ def _side_by_side(args: argparse.Namespace) -> int:
     }
     page = write_detection_report(
         args.out, found.measured, found.scored, strips, alpha=args.alpha, level=args.level, seed=args.seed,
-        about=about, pairs=found.pairs,
+        about=about, pairs=found.pairs, against=args.against,
     )  # fmt: skip
     print(detection_text(found.measured, found.pairs, args.alpha, args.level))
     for remark in remarks:
@@ -169,6 +181,27 @@ def _side_by_side(args: argparse.Namespace) -> int:
         if m.saved:
             print(f"use it: --policy.monitor.path={m.saved}")
     print(f"\npage {page}\nnumbers {args.out / 'detectors.json'}")
+    return 0
+
+
+def _from_scores(args: argparse.Namespace) -> int:
+    """Reports a finished comparison of detectors again."""
+    from lerobot_roborecover.analysis.detection_page import (
+        DETECTION_FILES,
+        detection_text,
+        write_detection_report,
+    )
+    from lerobot_roborecover.analysis.stored_comparison import read_comparison
+    from lerobot_roborecover.outputs import check_page
+
+    check_page(args.out, DETECTION_FILES)
+    found = read_comparison(args.scores)
+    page = write_detection_report(
+        args.out, found.measured, found.scored, (), alpha=found.alpha, level=found.level, seed=found.seed,
+        about=found.about, pairs=found.pairs, against=found.against,
+    )  # fmt: skip
+    print(detection_text(found.measured, found.pairs, found.alpha, found.level))
+    print(f"\npage {page}")
     return 0
 
 
