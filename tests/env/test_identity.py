@@ -9,7 +9,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.env.identity import content_hash, file_sha256, object_identity, policy_identity
@@ -34,14 +36,17 @@ def checkpoints(tmp_path_factory):
     base = root / BASE
     base.mkdir()
     (base / "config.json").write_text("{}")
-    (base / "model.safetensors").write_bytes(b"base weights")
+    save_file({"base": np.ones(3, np.float32)}, base / "model.safetensors")
     (policy / "adapter_config.json").write_text(json.dumps({"base_model_name_or_path": str(base)}))
     for name in (
         "adapter_model.safetensors", "model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors",
         "model.safetensors.index.json", "tokenizer.model", "experiment_cfg/metadata.json",
     ):  # fmt: skip
         (policy / name).parent.mkdir(exist_ok=True)
-        (policy / name).write_bytes(b"{}")
+        if name.endswith(".safetensors"):
+            save_file({"weight": np.ones(3, np.float32)}, policy / name)
+        else:
+            (policy / name).write_bytes(b"{}")
     return root
 
 
@@ -105,7 +110,8 @@ def test_every_file_of_a_checkpoint_counts(mine, key):
     assert any("normalizer_processor.safetensors" in name for name in names)
     for file in files:
         content = file.read_bytes()
-        file.write_bytes(content + b" ")
+        whole = file.suffix == ".safetensors"  # another length would be refused as damaged
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]) if whole else content + b" ")
         assert key(mine) != before, file
         file.write_bytes(content)
     assert key(mine) == before
