@@ -106,7 +106,7 @@ def run_trials(
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
-            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch, portable=True)
+            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch)
             places = EnginePlaces(
                 workplace, slots, replicas, str(config.device), env.obs_type != "state",
                 snapshot_dir=env.snapshot_dir or None,
