@@ -20,6 +20,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lerobot_roborecover.analysis.fork_gain import fork_gains
+from lerobot_roborecover.analysis.fork_page import write_gains
+from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
@@ -220,6 +223,9 @@ def main() -> None:
     if args.stored:
         stored = stored_logs(stored_folder(args.platform))
         report({name: stored[name] for name in ARMS}, args.out)
+        gains = fork_gains(read_trial_log(stored["forks"]))
+        tables = write_gains(gains, args.out / "forks", "python -m recipes.stepping_in --stored")
+        print("\n".join(to_text(table) for table in tables[:2]))
         return
     subject = SUBJECTS[args.platform]
     if not subject.base.is_dir():
