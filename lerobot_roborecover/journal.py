@@ -36,7 +36,7 @@ def open_locked(path: Path, mode: str) -> IO[Any]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        file = open(path, mode)  # noqa: SIM115 - lives as long as whoever asked
+        file = open(path, mode)  # noqa: SIM115 - the caller closes it
         try:
             if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
                 raise InUseError(f"{path} is in use by another process")

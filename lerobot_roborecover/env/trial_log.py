@@ -100,7 +100,7 @@ def read_log(path: Path, policy: str | None = None) -> ReadLog:
             rows: list[TrialRow] = []
             for line, row in _checked_rows(complete_lines(log.file, MAX_LINE_BYTES), str(path)):
                 policies[normalize("NFC", row.policy)] = None
-                # Nobody has seen the row yet. Canonically equal names are one name.
+                # The row is not shared yet. Canonically equal names are one name.
                 object.__setattr__(row, "policy", normalize("NFC", row.policy if policy is None else policy))
                 lines.append(line)
                 rows.append(row)

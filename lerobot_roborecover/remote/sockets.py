@@ -1,7 +1,7 @@
 """Listening sockets of a policy server: how many clients may be in the middle of their handshake.
 
 A client that connects and says nothing costs a descriptor until its handshake times out. Without a limit a
-hundred of them leave none for anybody else, and asyncio logs a traceback for each attempt to accept another.
+hundred of them leave none for other clients, and asyncio logs a traceback for each attempt to accept another.
 """
 
 from __future__ import annotations

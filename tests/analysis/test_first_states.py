@@ -192,7 +192,7 @@ def test_a_plan_says_how_many_first_states_a_set_has(capsys):
 
 
 def test_scenarios_that_share_a_hard_first_state_are_no_trials_until_success(tmp_path):
-    """More scenarios at first states that are not solved: nobody retried anything."""
+    """More scenarios at first states that are not solved: no trial was retried."""
     rows = []
     for state in range(40):
         for copy in range(1 if state % 2 else 4):

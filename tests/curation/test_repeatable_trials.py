@@ -1,4 +1,4 @@
-"""Trials whose outcomes are stored are the same again, whoever waits for the policy beside them."""
+"""Trials whose outcomes are stored are the same again, whichever trials share their batch."""
 
 from __future__ import annotations
 

@@ -230,7 +230,7 @@ def test_nothing_else_counts(mine, key, tmp_path):
     results.mkdir()
     for name in ("trials.jsonl", "eval_info.json", "anything.json"):
         (results / name).write_text("x")
-    assert key(mine, **same) == before, "what nobody loads"
+    assert key(mine, **same) == before, "files that are not loaded"
     elsewhere = tmp_path / "other" / "act"
     shutil.move(mine, elsewhere)
     assert key(elsewhere, **same) == before, "where the folder is"

@@ -18,7 +18,7 @@ _LABELS = re.compile(r"S:([^;]*);D:([^;]*)")
 
 
 class LiftedByOption(ScenarioError):
-    """A record is refused as long as nobody asks for it by the option that the message names."""
+    """A record is refused until the user asks for it by the option that the message names."""
 
 
 def _integer(value: object) -> str:
@@ -111,7 +111,7 @@ def check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) -> 
     """Checks that a record has its platform's fields, and each of them by itself.
 
     Raises:
-        LiftedByOption: it has others, and nobody asked to keep them.
+        LiftedByOption: it has others, and no option keeps them.
         ScenarioError: a field is missing or is not what it must be.
     """
     fields = _FIELDS[platform]
