@@ -66,8 +66,10 @@ def stand_in(folder: Path, name: str) -> Path:
 
 @pytest.fixture
 def parse(monkeypatch, tmp_path):
-    """The configuration that `lerobot-eval` would run with, and what RoboRecover finds in it; a remote policy's
-    server answers, and says nothing of itself."""
+    """The configuration that `lerobot-eval` would run with, and what RoboRecover finds in it.
+
+    A remote policy's server answers, and says nothing of itself.
+    """
     silent = SimpleNamespace(reach=dict, close=lambda: None)
     monkeypatch.setattr("lerobot_roborecover.remote.identity.make_server", lambda *_: silent)
 
