@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from lerobot_roborecover.analysis.detection import NEEDS_HELP
+from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.stepping_in import ARMS, stored_folder
 from tests.support.trial_rows import policy_rows, write_log
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def test_stored_logs_come_back(tmp_path):
@@ -44,3 +50,36 @@ def test_what_the_repository_keeps_is_whole():
     for of in rows.values():
         assert {row.scenario_id for row in of} == ids
         assert len(of) == len(ids)
+
+
+def rate_of(success: dict[str, bool]) -> str:
+    return f"{100 * sum(success.values()) / len(success):.1f}"
+
+
+def test_the_page_on_intervention_timing_says_what_is_stored():
+    page = (DOCS / "stepping_in.md").read_text(encoding="utf-8")
+    logs = stored_logs(stored_folder("metaworld"))
+    success = {name: {r.scenario_id: r.success for r in read_trial_log(logs[name])} for name in ARMS}
+    direct = success[ARMS[0]]
+    assert f"| `direct` | {rate_of(direct)} [" in page
+    for name in ARMS[1:]:
+        rescued = sum(success[name][i] and not direct[i] for i in direct)
+        harmed = sum(direct[i] and not success[name][i] for i in direct)
+        row = next(
+            line for line in page.splitlines() if line.startswith(f"| `{name}` | {rate_of(success[name])}")
+        )
+        assert f"| {100 * (rescued - harmed) / 359:+.1f} [" in row
+        assert f"| {rescued} / {harmed} |" in row
+
+
+@pytest.mark.parametrize("name", ["detectors", "detectors_recovery"])
+def test_the_page_on_detectors_says_what_is_stored(name):
+    page = (DOCS / "detectors.md").read_text(encoding="utf-8")
+    found = read_comparison(OUTCOMES / name)
+    assert len(found.measured) == 9
+    for detector in found.measured:
+        area = detector.report.rankings[NEEDS_HELP].roc.area
+        alarmed = detector.report.conformal.clean_alarmed
+        for value in (area, alarmed):
+            shown = f"{100 * value.value:.1f} [{100 * value.low:.1f}, {100 * value.high:.1f}]"
+            assert f"| `{detector.name}` | {shown} |" in page
