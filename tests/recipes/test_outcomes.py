@@ -72,7 +72,7 @@ def test_the_page_on_intervention_timing_says_what_is_stored():
         assert f"| {rescued} / {harmed} |" in row
 
 
-@pytest.mark.parametrize("name", ["detectors", "detectors_recovery"])
+@pytest.mark.parametrize("name", ["detectors", pytest.param("detectors_recovery", marks=pytest.mark.nightly)])
 def test_the_page_on_detectors_says_what_is_stored(name):
     page = (DOCS / "detectors.md").read_text(encoding="utf-8")
     found = read_comparison(OUTCOMES / name)
