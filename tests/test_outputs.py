@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 
@@ -123,7 +124,8 @@ def test_a_plan_replaces_earlier_plans_only(tmp_path, capsys):
 
 
 def test_a_run_replaces_no_other_runs_eval_info(tmp_path):
-    path, log = tmp_path / "eval_info.json", tmp_path / "trials.jsonl"
+    path = tmp_path / "eval_info.json"
+    log = SimpleNamespace(path=tmp_path / "trials.jsonl", rows=[SimpleNamespace(scenario_id="s001")])
     check_eval_info(path, log)
     path.write_text(json.dumps({"per_task": []}))
     check_eval_info(path, log)
@@ -131,3 +133,5 @@ def test_a_run_replaces_no_other_runs_eval_info(tmp_path):
         path.write_text(text)
         with pytest.raises(OutputExistsError, match="the results of another run"):
             check_eval_info(path, log)
+    path.write_text(json.dumps({"per_task": [{"task_id": "s001"}]}))
+    check_eval_info(path, log)

@@ -11,6 +11,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.intervals import rate_interval, spread
 from lerobot_roborecover.env.run import group_name
+from lerobot_roborecover.env.trial_log import RowLog
 from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.outputs import OutputExistsError
 
@@ -59,25 +60,29 @@ def eval_info(
     }
 
 
-def check_eval_info(path: Path, log: Path) -> None:
+def check_eval_info(path: Path, log: RowLog) -> None:
     """Checks that a run whose log has no trial of it yet replaces no other run's results.
+
+    Results whose trials are in the log are replaced: such as those of the same policy before its
+    normalisation statistics were corrected.
 
     Args:
         path: `eval_info.json` that the run will write.
         log: the run's trial log.
 
     Raises:
-        OutputExistsError: the file holds episodes, or is something else.
+        OutputExistsError: the file holds episodes that are not in the log, or is something else.
     """
     if not path.exists() and not path.is_symlink():
         return
+    logged = {row.scenario_id for row in log.rows}
     try:
-        empty = not json.loads(path.read_bytes())["per_task"]
+        kept = all(task["task_id"] in logged for task in json.loads(path.read_bytes())["per_task"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        empty = False
-    if not empty:
+        kept = False
+    if not kept:
         raise OutputExistsError(
-            f"{path} holds the results of another run: {log} has no trial of this one. Name another "
+            f"{path} holds the results of another run, whose trials are not in {log.path}. Name another "
             "--output_dir, or move the file away"
         )
 

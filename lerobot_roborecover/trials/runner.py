@@ -215,7 +215,7 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
     log = run.kept_log()
     run.protocol = replace(run.protocol, run_seed=cfg.seed)
     if not run.rows():
-        check_eval_info(out / "eval_info.json", log.path)
+        check_eval_info(out / "eval_info.json", log)
     if cfg.runner.retried:
         again, beside = run.retry(cfg.runner.retried)
         print(f"{counted(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)

@@ -45,9 +45,9 @@ def test_means_are_those_of_scenarios_means(tmp_path):
 def test_partial_credit_by_hand(tmp_path):
     """Up to a half, down by thirty, never above the handoff's ten again; and up for good after two steps."""
     rows = [
-        trial_row(0, 0, False, steps=4, progress=[10, 50, 20, 5, 10]),
+        trial_row(0, 0, False, steps=4, horizon=4, progress=[10, 50, 20, 5, 10]),
         trial_row(1, 0, True, steps=4, progress=[10, 0, 10, 60, 100]),
-        trial_row(2, 0, False, steps=3, progress=[0, 0, 0, 0]),
+        trial_row(2, 0, False, steps=3, horizon=3, progress=[0, 0, 0, 0]),
         trial_row(3, 0, outcome="sim_error"),
     ]
     best, drawdown, lasting = METRICS[2:]

@@ -248,14 +248,16 @@ def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, c
 def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_path, monkeypatch):
     """As where a cluster's machine with the policy is lost for good."""
     from lerobot_roborecover.curation.collect.rollouts import run_policy
+    from lerobot_roborecover.trials.engine import Engine
 
     class Away:
         unrun: ClassVar = {("toy-p-s0", 0): "nobody answers"}
+        check_all_run = Engine.check_all_run
 
         def run(self, units):
             assert [u.scenario.seed for u in units] == [0]
 
     monkeypatch.setattr("lerobot_roborecover.trials.places.open_engine", lambda *_: Away())
     planned = SimpleNamespace(seed=0, trial=0, driver="p")
-    with pytest.raises(ScenarioError, match=r"1 rollout could not be run.*nobody answers.*command again"):
+    with pytest.raises(ScenarioError, match=r"1 trial could not be run.*nobody answers.*command again"):
         run_policy([[planned]], None, None, None, 7, lambda ended, record: None)
