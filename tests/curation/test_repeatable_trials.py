@@ -63,7 +63,7 @@ PROGRAM = """
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_libero_policys_actions_do_not_depend_on_threads(tmp_path):
     """One observation an inference, with the kernels of the study."""
     policy = Path(__file__).parents[2] / "policies" / "libero" / "act_few"

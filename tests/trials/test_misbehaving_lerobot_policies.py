@@ -70,7 +70,14 @@ def bad_tensors():
 
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("act", None), ("diffusion", ("a row", "one column", "an axis less", "complex", "nothing"))],
+    [
+        ("act", None),
+        pytest.param(
+            "diffusion",
+            ("a row", "one column", "an axis less", "complex", "nothing"),
+            marks=pytest.mark.nightly,
+        ),
+    ],
 )
 def test_what_evaluate_makes_of_bad_tensors(dataset, checkpoints, spoil, kind, names):
     """One column would be broadcast by the normalisation, and one row to the whole batch."""
@@ -97,7 +104,10 @@ def test_evaluate_comes_back_from_a_policy_that_blocks(dataset, checkpoints, spo
     assert "could not be run, and have no row" in caplog.text
 
 
-@pytest.mark.parametrize(("extra", "status"), [("--env.policy_watchdog_s=5", 1), ("--limit-seconds=1", 0)])
+@pytest.mark.parametrize(
+    ("extra", "status"),
+    [pytest.param("--env.policy_watchdog_s=5", 1, marks=pytest.mark.nightly), ("--limit-seconds=1", 0)],
+)
 def test_the_command_ends_where_the_policy_blocks(
     dataset, checkpoints, spoil, tmp_path, capsys, extra, status
 ):
@@ -122,7 +132,7 @@ def test_the_command_ends_where_the_policy_blocks(
     assert (tmp_path / "out" / "eval_info.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_process_ends_where_the_policy_blocks(dataset, checkpoints, tmp_path):
     program = """
         import sys, time

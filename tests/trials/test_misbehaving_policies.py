@@ -241,7 +241,7 @@ HUNG_LOOP = """
 """
 
 
-@pytest.mark.parametrize("stubborn", [False, True])
+@pytest.mark.parametrize("stubborn", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_lerobots_loop_ends_where_the_policy_blocks(dataset, tmp_path, stubborn):
     program = textwrap.dedent(HUNG_LOOP).replace("{stubborn}", str(stubborn))
     log = tmp_path / "log.jsonl"
