@@ -76,7 +76,7 @@ def test_frames_of_the_video(tmp_path):
     for scenario in scenarios:
         actions = np.random.default_rng(9).uniform(-1, 1, (6, 4)).astype(np.float32)
         row = trial_row(scenario.id, 0, False, platform="metaworld", scenario_sha256=scenario.sha256(),
-                        steps=6, actions_sha256=actions_digest(actions))  # fmt: skip
+                        steps=6, horizon=6, actions_sha256=actions_digest(actions))  # fmt: skip
         np.save(actions_path(folder / ACTIONS_FOLDER, row), actions)
         rows.append(json.dumps(asdict(row)) + "\n")
     (folder / "trials.jsonl").write_text("".join(rows))
