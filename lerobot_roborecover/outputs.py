@@ -11,7 +11,9 @@ Folders of datasets are new or empty (`whole.check_new`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import shutil
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from lerobot_roborecover.errors import RoboRecoverError
@@ -81,8 +83,11 @@ def check_page(
         )
 
 
-def claim_page(folder: Path, names: Sequence[str]) -> None:
-    """Makes a folder one of an HTML page, so that a page that a crash cut short is made anew.
+@contextmanager
+def claim_page(folder: Path, names: Sequence[str]) -> Generator[None]:
+    """Marks a folder as one of an HTML page while the block writes it.
+
+    A page that a crash cut short is made anew by the next run. An error before the first file leaves nothing.
 
     Args:
         folder: of the page; made if need be.
@@ -92,8 +97,22 @@ def claim_page(folder: Path, names: Sequence[str]) -> None:
         OutputExistsError: a file or folder of these names exists that this command did not make.
     """
     check_page(folder, names)
-    if not (folder / names[0]).exists():
-        write_whole(folder / names[0], _UNFINISHED)
+    page, others = folder / names[0], [folder / name for name in names[1:]]
+    marked = not page.exists()
+    if marked:
+        write_whole(page, _UNFINISHED)
+    try:
+        yield
+    except Exception:
+        if marked and not any(_holds_a_file(path) for path in others):
+            page.unlink(missing_ok=True)
+            for path in others:  # at most empty folders
+                shutil.rmtree(path, ignore_errors=True)
+        raise
+
+
+def _holds_a_file(path: Path) -> bool:
+    return path.is_file() or any(inner.is_file() for inner in path.rglob("*"))
 
 
 def _has_footer(page: Path) -> bool:

@@ -103,12 +103,21 @@ def test_a_page_is_made_again_and_other_files_stay(tmp_path):
 
 def test_a_page_that_a_crash_cut_short_is_made_again(tmp_path):
     names = ("page.html", "numbers.json")
-    claim_page(tmp_path / "out", names)
-    write_whole(tmp_path / "out" / "numbers.json", "{}")
+    with pytest.raises(OSError, match="full"), claim_page(tmp_path / "out", names):
+        raise OSError("the disk is full")
+    assert list((tmp_path / "out").iterdir()) == []
+
+    def writes_a_part():
+        with claim_page(tmp_path / "out", names):
+            write_whole(tmp_path / "out" / "numbers.json", "{}")
+            raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        writes_a_part()
     check_page(tmp_path / "out", names)
     (tmp_path / "out" / "page.html").unlink()
-    with pytest.raises(OutputExistsError, match=r"numbers\.json exists"):
-        claim_page(tmp_path / "out", names)
+    with pytest.raises(OutputExistsError, match=r"numbers\.json exists"), claim_page(tmp_path / "out", names):
+        pass
     with pytest.raises(OutputExistsError, match="is not a folder"):
         check_page(tmp_path / "out" / "numbers.json", names)
 

@@ -175,36 +175,36 @@ def write_detection_report(
         The page.
     """
     tables = [*_results(measured, pairs, alpha, level), input_table(measured)]
-    claim_page(out, DETECTION_FILES)
-    for table in tables:
-        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
-        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
-    write_whole(out / "detectors.md", "\n".join(map(to_markdown, tables)))
-    reports = {m.name: m.report for m in measured}
-    figures = detection_figures(reports)
-    films = [strip_figure(strip, scored, reports, seed) for strip in strips]
-    for figure in [*figures, *films]:
-        write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
-        write_whole(out / f"{figure.name}.png", png_of(figure.plot))
-    for name, trials in scored.items():
-        write_scores(out / SCORES_FOLDER / f"{name}.npz", trials)
-    numbers = {
-        "schema_version": SCHEMA_VERSION,
-        "about": dict(about),
-        "alpha": alpha,
-        "level": level,
-        "seed": seed,
-        "against": list(against),
-        "detectors": {m.name: detector_json(m) for m in measured},
-        "pairs": [_pair_json(c) for c in pairs],
-    }
-    write_whole(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
-    page = render_page(
-        "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
-        pictures=_pictures(figures), films=_pictures(films),
-    )  # fmt: skip
-    write_whole(out / "detectors.html", page)
-    return out / "detectors.html"
+    with claim_page(out, DETECTION_FILES):
+        for table in tables:
+            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
+            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
+        write_whole(out / "detectors.md", "\n".join(map(to_markdown, tables)))
+        reports = {m.name: m.report for m in measured}
+        figures = detection_figures(reports)
+        films = [strip_figure(strip, scored, reports, seed) for strip in strips]
+        for figure in [*figures, *films]:
+            write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
+            write_whole(out / f"{figure.name}.png", png_of(figure.plot))
+        for name, trials in scored.items():
+            write_scores(out / SCORES_FOLDER / f"{name}.npz", trials)
+        numbers = {
+            "schema_version": SCHEMA_VERSION,
+            "about": dict(about),
+            "alpha": alpha,
+            "level": level,
+            "seed": seed,
+            "against": list(against),
+            "detectors": {m.name: detector_json(m) for m in measured},
+            "pairs": [_pair_json(c) for c in pairs],
+        }
+        write_whole(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
+        page = render_page(
+            "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
+            pictures=_pictures(figures), films=_pictures(films),
+        )  # fmt: skip
+        write_whole(out / "detectors.html", page)
+        return out / "detectors.html"
 
 
 def detection_text(

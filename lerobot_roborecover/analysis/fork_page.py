@@ -27,19 +27,19 @@ def write_gains(gains: ForkGains, out: Path, command: str) -> list[Table]:
         The tables.
     """
     tables, figure = gain_tables(gains), gain_by_step(gains)
-    claim_page(out, (PAGE, "gain.md", "fork_gain.svg", "fork_gain.png"))
-    svg, png = render(figure)
-    write_whole(out / "fork_gain.svg", svg)
-    write_whole(out / "fork_gain.png", png)
-    for table in tables:
-        write_whole(out / f"{table.name}.csv", to_csv(table))
-    write_whole(out / "gain.md", "\n".join(map(to_markdown, tables)))
-    about = {"Made by": command, "Exactness": reproduced_text(gains)}
-    page = render_page(
-        "tables_figures.html.j2", title="Forks", about=about, pictures=[picture(figure)], tables=tables
-    )
-    write_whole(out / PAGE, page)
-    return tables
+    with claim_page(out, (PAGE, "gain.md", "fork_gain.svg", "fork_gain.png")):
+        svg, png = render(figure)
+        write_whole(out / "fork_gain.svg", svg)
+        write_whole(out / "fork_gain.png", png)
+        for table in tables:
+            write_whole(out / f"{table.name}.csv", to_csv(table))
+        write_whole(out / "gain.md", "\n".join(map(to_markdown, tables)))
+        about = {"Made by": command, "Exactness": reproduced_text(gains)}
+        page = render_page(
+            "tables_figures.html.j2", title="Forks", about=about, pictures=[picture(figure)], tables=tables
+        )
+        write_whole(out / PAGE, page)
+        return tables
 
 
 def reproduced_text(gains: ForkGains) -> str:

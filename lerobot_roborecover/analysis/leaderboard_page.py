@@ -38,10 +38,10 @@ def write_leaderboard(
     ]
     page = render_page("leaderboard.html.j2", title=title, boards=boards, refused=found.refused)
     files = out / "index.html", out / "leaderboard.json"
-    claim_page(out, [path.name for path in files])
-    for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
-        write_whole(path, text)
-    return files
+    with claim_page(out, [path.name for path in files]):
+        for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
+            write_whole(path, text)
+        return files
 
 
 def board_table(board: Board, number: int = 0) -> Table:

@@ -197,31 +197,31 @@ def write_monitor_report(
         The page.
     """
     tables = [metrics_table(measured, level), confusion_table(measured), episode_table(measured)]
-    claim_page(out, MONITOR_FILES)
-    for table in tables:
-        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
-        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
-    write_whole(out / "monitor.md", "\n".join(map(to_markdown, tables)))
-    pictures = []
-    for figure in figures(measured):
-        write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
-        write_whole(out / f"{figure.name}.png", png_of(figure.plot))
-        pictures.append(picture(figure))
-    for m in measured:
-        _write_frames(out / "frames" / f"{m.name}.csv", m.frames)
-        for name in ("precision_recall", "roc"):
-            _write_curve(out / "curves" / f"{m.name}_{name}.csv", getattr(m.report, name), name)
-    numbers = {
-        "about": dict(about),
-        "level": level,
-        "datasets": {m.name: to_json(m.report) for m in measured},
-    }
-    write_whole(out / "metrics.json", json.dumps(numbers, indent=1, default=str) + "\n")
-    page = render_page(
-        "tables_figures.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
-    )
-    write_whole(out / "monitor.html", page)
-    return out / "monitor.html"
+    with claim_page(out, MONITOR_FILES):
+        for table in tables:
+            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
+            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
+        write_whole(out / "monitor.md", "\n".join(map(to_markdown, tables)))
+        pictures = []
+        for figure in figures(measured):
+            write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
+            write_whole(out / f"{figure.name}.png", png_of(figure.plot))
+            pictures.append(picture(figure))
+        for m in measured:
+            _write_frames(out / "frames" / f"{m.name}.csv", m.frames)
+            for name in ("precision_recall", "roc"):
+                _write_curve(out / "curves" / f"{m.name}_{name}.csv", getattr(m.report, name), name)
+        numbers = {
+            "about": dict(about),
+            "level": level,
+            "datasets": {m.name: to_json(m.report) for m in measured},
+        }
+        write_whole(out / "metrics.json", json.dumps(numbers, indent=1, default=str) + "\n")
+        page = render_page(
+            "tables_figures.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
+        )
+        write_whole(out / "monitor.html", page)
+        return out / "monitor.html"
 
 
 def to_json(report: MonitorReport) -> dict[str, Any]:

@@ -97,31 +97,34 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
     Raises:
         OutputExistsError: a file of these names in `out` is of no earlier report.
     """
-    claim_page(out, REPORT_FILES)
-    extras = extras or Extras()
-    tables = all_tables(results)
-    remarks = [*results.remarks, *extras.remarks]
-    images: dict[str, dict[str, str]] = {}
-    for figure in all_figures(results):
-        wide, narrow = drawn_as_svg(figure)
-        write_whole(out / "figures" / f"{figure.name}.svg", wide)
-        write_whole(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
-        if narrow is not None:
-            write_whole(out / "figures" / f"{figure.name}_narrow.svg", narrow)
-        images[figure.name] = picture(figure, (wide, narrow))
-    for table in tables:
-        write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
-        write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
-    provenance = provenance_of(results, extras.command)
-    write_whole(
-        out / "results.json", json.dumps(_as_json(results, tables, remarks, provenance), indent=1).encode()
-    )
-    write_whole(out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode())
-    cards = make_cards(results.recovery, extras.frames, extras.clips, results.initial)
-    write_whole(
-        out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
-    )
-    return ReportFiles(out / "report.html", out / "report.md", out / "results.json", tuple(tables))
+    with claim_page(out, REPORT_FILES):
+        extras = extras or Extras()
+        tables = all_tables(results)
+        remarks = [*results.remarks, *extras.remarks]
+        images: dict[str, dict[str, str]] = {}
+        for figure in all_figures(results):
+            wide, narrow = drawn_as_svg(figure)
+            write_whole(out / "figures" / f"{figure.name}.svg", wide)
+            write_whole(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
+            if narrow is not None:
+                write_whole(out / "figures" / f"{figure.name}_narrow.svg", narrow)
+            images[figure.name] = picture(figure, (wide, narrow))
+        for table in tables:
+            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
+            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
+        provenance = provenance_of(results, extras.command)
+        write_whole(
+            out / "results.json",
+            json.dumps(_as_json(results, tables, remarks, provenance), indent=1).encode(),
+        )
+        write_whole(
+            out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode()
+        )
+        cards = make_cards(results.recovery, extras.frames, extras.clips, results.initial)
+        write_whole(
+            out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
+        )
+        return ReportFiles(out / "report.html", out / "report.md", out / "results.json", tuple(tables))
 
 
 def provenance_of(results: Results, command: str = "") -> dict[str, Any]:

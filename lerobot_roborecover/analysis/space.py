@@ -51,31 +51,31 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
     config = config or SpaceConfig()
     remarks: list[str] = []
     pages = [f"scenarios-{n + 1}.html" for n in range(len(found.boards))]
-    claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages])
-    write_leaderboard(found, out, config.title, pages)
-    for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
-        frames, problems = _frames(board, trials, out, config.render)
-        clips = _media(config.media, trials.recovery, out)
-        cards = make_cards(trials.recovery, frames, clips, trials.initial)
-        page = render_page(
-            "gallery_page.html.j2",
-            title=f"{config.title}: {board.platform}, {board.dataset}",
-            scripts=("gallery.js",),
-            with_files=True,
-            board=board,
-            **gallery_values(cards),
-        )
-        write_whole(out / name, page)
-        remarks += [f"{board.dataset}: {problem}" for problem in problems]
-    used = {policy for policy, _ in config.media}
-    policies = {arm for trials in found.trials for arm in trials.recovery.arms}
-    if used - policies:
-        remarks.append(
-            f"videos of {', '.join(sorted(used - policies))}: no policy of these logs is called so; there "
-            f"are {', '.join(sorted(policies))}"
-        )
-    write_whole(out / "README.md", _card(config.title, found))
-    return remarks
+    with claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages]):
+        write_leaderboard(found, out, config.title, pages)
+        for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
+            frames, problems = _frames(board, trials, out, config.render)
+            clips = _media(config.media, trials.recovery, out)
+            cards = make_cards(trials.recovery, frames, clips, trials.initial)
+            page = render_page(
+                "gallery_page.html.j2",
+                title=f"{config.title}: {board.platform}, {board.dataset}",
+                scripts=("gallery.js",),
+                with_files=True,
+                board=board,
+                **gallery_values(cards),
+            )
+            write_whole(out / name, page)
+            remarks += [f"{board.dataset}: {problem}" for problem in problems]
+        used = {policy for policy, _ in config.media}
+        policies = {arm for trials in found.trials for arm in trials.recovery.arms}
+        if used - policies:
+            remarks.append(
+                f"videos of {', '.join(sorted(used - policies))}: no policy of these logs is called so; "
+                f"there are {', '.join(sorted(policies))}"
+            )
+        write_whole(out / "README.md", _card(config.title, found))
+        return remarks
 
 
 def _frames(
