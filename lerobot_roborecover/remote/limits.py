@@ -63,7 +63,7 @@ class ByteBudget:
             for waiting in list(self._paused):
                 if self._may_read(waiting):
                     del self._paused[waiting]
-                    waiting.transport.resume_reading()
+                    waiting.resume()
 
     def drop(self, connection: LimitedConnection) -> None:
         """Forgets a connection that is closed."""
@@ -97,7 +97,7 @@ class LimitedConnection(ServerConnection):
         self._report()
         large = self._partial + self._queued > SHARE_BYTES and not self._working
         if large and self._deadline is None:
-            self._deadline = self.loop.call_later(RECEIVE_TIMEOUT_S, self._expire)
+            self._start_deadline()
 
     def process_event(self, event: Any) -> None:
         """Takes a frame, or the handshake's request, off what has arrived."""
@@ -126,6 +126,13 @@ class LimitedConnection(ServerConnection):
         self._working = len(message.encode() if isinstance(message, str) else message)
         self._queued = max(0, self._queued - self._working)
 
+    def resume(self) -> None:
+        """Reads on after a pause, which does not count against the connection's time."""
+        if self._deadline is not None:
+            self._stop_deadline()
+            self._start_deadline()
+        self.transport.resume_reading()
+
     def end(self) -> None:
         """Called when the request is answered."""
         self._working = 0
@@ -141,13 +148,16 @@ class LimitedConnection(ServerConnection):
         if self._working:
             return
         if self._budget.is_paused(self):
-            self._deadline = self.loop.call_later(RECEIVE_TIMEOUT_S, self._expire)
+            self._start_deadline()
             return
         logger.warning(
             "connection %s closed: its request of more than %d bytes did not arrive within %g s", self.id,
             SHARE_BYTES, RECEIVE_TIMEOUT_S,
         )  # fmt: skip
         self.transport.abort()
+
+    def _start_deadline(self) -> None:
+        self._deadline = self.loop.call_later(RECEIVE_TIMEOUT_S, self._expire)
 
     def _stop_deadline(self) -> None:
         if self._deadline is not None:
