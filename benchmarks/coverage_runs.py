@@ -17,7 +17,12 @@ import numpy as np
 from coverage_settings import Line, alike, held, rng_of, scenario_rates
 from scipy import special
 
-from lerobot_roborecover.analysis.intervals import Spread, difference_interval, difference_p, rate_interval
+from lerobot_roborecover.analysis.intervals import (
+    WeightedMean,
+    difference_interval,
+    difference_p,
+    rate_interval,
+)
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.runs import (
     RunRates,
@@ -26,9 +31,9 @@ from lerobot_roborecover.analysis.runs import (
     hierarchical_bootstrap,
 )
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest
+from lerobot_roborecover.analysis.sequential_pairs import watched_pair
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, LEAST_RUNS
-from lerobot_roborecover.analysis.watched import watched_pair
 
 RUNS = (2, 3, 5, 10)
 BETWEEN = (0.0, 0.3, 0.8)
@@ -48,8 +53,10 @@ def _mean_rate(p: float, sd: float) -> float:
     return float(special.expit(hard + rng.normal(0, sd * np.sqrt(2), len(hard))).mean())
 
 
-def _many(found: list[Spread]) -> Spread:
-    return Spread(*(np.array([getattr(f, name) for f in found]) for name in Spread.__dataclass_fields__))
+def _many(found: list[WeightedMean]) -> WeightedMean:
+    return WeightedMean(
+        *(np.array([getattr(f, name) for f in found]) for name in WeightedMean.__dataclass_fields__)
+    )
 
 
 def runs(replicates: int) -> Iterator[Line]:

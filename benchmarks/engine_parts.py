@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.options import RecoveryOptions
-from lerobot_roborecover.env.run import PlatformPart, open_run
+from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.options import RecoveryOptions
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Reset, Scenario, Task
-from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.local import LocalEngine
 from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import WorkerSlot
 
@@ -89,8 +89,11 @@ def run_engine(
         options = RecoveryOptions(
             scenarios=str(root), trial_log=f"{folder}/log.jsonl", strict_versions=False, handoff_check=False
         )
-        loaded, run = open_run(
-            options, PlatformPart(slot, {}, None), workers=True, facts=RunFacts("stub", n_episodes=trials)
+        loaded, run = create_session(
+            options,
+            SimulatorSpec(slot, {}, None),
+            workers=True,
+            facts=PolicyMetadata("stub", n_episodes=trials),
         )
         run.protocol = replace(run.protocol, run_seed=0)
         run.pool.acquire()

@@ -29,8 +29,8 @@ from pathlib import Path
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_trial_log
 
 WIDTHS = {"roborecover_libero": (8, 7), "roborecover_metaworld": (4, 4)}
 """State and action of each platform."""

@@ -36,14 +36,14 @@ from engine_parts import (
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.options import RecoveryOptions
-from lerobot_roborecover.env.run import PlatformPart, open_run
+from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.options import RecoveryOptions
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
-from lerobot_roborecover.snapshots import SnapshotCache
-from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.local import LocalEngine
+from lerobot_roborecover.policies.metadata import PolicyMetadata
+from lerobot_roborecover.replay.handoff import hand_off
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import WorkerSlot
 
@@ -206,8 +206,8 @@ def startup_one(args: argparse.Namespace) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         root = write_scenarios(Path(folder) / "set", scenarios)
         options = RecoveryOptions(scenarios=str(root), trial_log=f"{folder}/log.jsonl", strict_versions=False)
-        loaded, run = open_run(
-            options, PlatformPart(config, {}, None), workers=True, facts=RunFacts("stub", n_episodes=1)
+        loaded, run = create_session(
+            options, SimulatorSpec(config, {}, None), workers=True, facts=PolicyMetadata("stub", n_episodes=1)
         )
         host = StubHost(7)
         run.pool.acquire()

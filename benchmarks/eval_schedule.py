@@ -16,7 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.trials.test_schedule import schedule
+from tests.evaluation.test_schedule import schedule
 
 
 def main() -> None:

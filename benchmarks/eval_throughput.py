@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from scipy import stats
 
-from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.env.trial_row import Protocol
-from lerobot_roborecover.policies.host import InlineReplica
-from lerobot_roborecover.trials.engine import Engine, units_of
+from lerobot_roborecover.evaluation.scheduler import Engine, units_of
+from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.logs.row import EvalProtocol
+from lerobot_roborecover.policies.runner import InlineReplica
 from tests.support.factories import fake_scenario
 from tests.support.virtual_time import VirtualHost, VirtualSlot, World
 
@@ -87,7 +87,7 @@ def of_engine(slots: int, times: Times, trials: int) -> Throughput:
         )
         for k in range(slots)
     ]  # fmt: skip
-    run = Run(None, Protocol("recovery", 0, "p", 0, times.executed), None, "d", None)
+    run = EvalSession(None, EvalProtocol("recovery", 0, "p", 0, times.executed), None, "d", None)
     seats = [VirtualSlot(world) for _ in range(slots)]
     engine = Engine(run, seats, [InlineReplica(host)], world.wait, clock=world.clock)
     assert engine.run(units_of(scenarios, trials)) == slots * trials

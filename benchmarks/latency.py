@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from lerobot_roborecover.analysis.latency import latency_figure, latency_rates, latency_table
 from lerobot_roborecover.analysis.style import png_of, svg_of
 from lerobot_roborecover.analysis.tables import to_csv, to_text
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -35,9 +35,9 @@ def main(argv: list[str] | None = None) -> None:
     rates = latency_rates(row for log in args.logs for row in read_trial_log(log))
     table, figure = latency_table(rates), latency_figure(rates)
     print(to_text(table))
-    write_whole(args.out / "latency.csv", to_csv(table))
-    write_whole(args.out / "latency.svg", svg_of(figure.plot))
-    write_whole(args.out / "latency.png", png_of(figure.plot))
+    atomic_write(args.out / "latency.csv", to_csv(table))
+    atomic_write(args.out / "latency.svg", svg_of(figure.plot))
+    atomic_write(args.out / "latency.png", png_of(figure.plot))
     print(f"figure    {args.out / 'latency.svg'}")
 
 

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.studio.teleop.starts import first_state
+from lerobot_roborecover.web.teleop.starts import first_state
 
 TASKS = {
     "libero": [

@@ -17,9 +17,9 @@ from collections.abc import Iterable
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.snapshots import SnapshotCache
 
 
 def measure(simulator: Simulator, scenario: Scenario, cache: SnapshotCache, steps: int) -> dict[str, float]:

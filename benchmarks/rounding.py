@@ -14,15 +14,15 @@ import os
 import subprocess
 import sys
 
-from lerobot_roborecover.rounding import CORE_TYPE, VARIABLE
+from lerobot_roborecover.utils.determinism import CORE_TYPE, VARIABLE
 
 
 def one(name: str, every: int) -> dict:
     """Replays the set's scenarios in this process."""
     from lerobot_roborecover import load_scenarios
     from lerobot_roborecover.platforms import make_simulator
-    from lerobot_roborecover.replay import hand_off
-    from lerobot_roborecover.rounding import core_type_in_use
+    from lerobot_roborecover.replay.handoff import hand_off
+    from lerobot_roborecover.utils.determinism import core_type_in_use
 
     scenarios = list(load_scenarios(name))[::every]
     simulator = make_simulator(scenarios[0].platform, obs_type="state")

@@ -28,7 +28,7 @@ from lerobot_roborecover.datasets.trajectory_write import write_metadata
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.platforms import SimulatorError, platform_named
 from lerobot_roborecover.scenario import ScenarioError, Task
-from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir, check_new
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,7 +71,7 @@ def convert(args: argparse.Namespace) -> list[TrajectoryRow]:
             {"dtype": "int64", "shape": (1,), "names": None},
         ),
     }
-    with new_folder(args.out) as folder:
+    with atomic_dir(args.out) as folder:
         add_features(source, added, output_dir=folder, repo_id=local_repo_id(args.out))
         write_metadata(
             folder, "rollouts", [], rows, description="Recorded rollouts, converted.", license=args.license

@@ -26,12 +26,12 @@ from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.release.convert import Conversion, Problem, platforms_of, read_release
-from lerobot_roborecover.datasets.release.earlier import compare_with_earlier, read_converted, read_earlier
 from lerobot_roborecover.datasets.release.export import export_release
 from lerobot_roborecover.datasets.release.initial_state import check_initial_state
-from lerobot_roborecover.datasets.release.lone import read_files
+from lerobot_roborecover.datasets.release.previous import compare_with_earlier, read_converted, read_earlier
 from lerobot_roborecover.datasets.release.record import Reading
 from lerobot_roborecover.datasets.release.robot import check_robot, initial_state_of
+from lerobot_roborecover.datasets.release.single_records import read_files
 from lerobot_roborecover.datasets.release.sources import Sources, read_sources
 from lerobot_roborecover.datasets.release.tables import PLATFORMS
 from lerobot_roborecover.datasets.render import check_rendering, render_dataset
@@ -41,7 +41,7 @@ from lerobot_roborecover.platforms.libero.assets import find_assets
 from lerobot_roborecover.platforms.robotwin.checkout import RobotwinCheckout
 from lerobot_roborecover.platforms.robotwin.render import QUALITIES
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import check_new, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write, check_new
 from lerobot_roborecover.workers.capacity import usable_cores
 from lerobot_roborecover.workers.jobs import JobPool
 
@@ -315,7 +315,7 @@ def _report(
         "refused": [vars(p) for p in result.failures],
         "warnings": [vars(p) for p in result.warnings],
     }
-    write_whole(out / FOLDER / "conversion.json", json.dumps(report, indent=2) + "\n")
+    atomic_write(out / FOLDER / "conversion.json", json.dumps(report, indent=2) + "\n")
 
 
 def _progress(what: str, done: int, total: int) -> None:

@@ -9,22 +9,21 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from lerobot_roborecover.rounding import pin_rounding
+from lerobot_roborecover.utils.determinism import pin_blas_kernels
 
-pin_rounding()  # before numpy is imported
+pin_blas_kernels()  # before numpy is imported
 
-from lerobot_roborecover.env.registration import register  # noqa: E402
-
-__version__ = "0.1.0"
+from lerobot_roborecover._version import __version__  # noqa: E402
+from lerobot_roborecover.workers.registration import register  # noqa: E402
 
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.make import report
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.env.trial_row import TrialRow
+    from lerobot_roborecover.evaluation.callback import EvaluationCallback, metrics_of
+    from lerobot_roborecover.evaluation.evaluate import evaluate
+    from lerobot_roborecover.logs.row import TrialRow
     from lerobot_roborecover.platforms import Platform
     from lerobot_roborecover.scenario import Rollout, Scenario
-    from lerobot_roborecover.trials.evaluation import evaluate
-    from lerobot_roborecover.trials.training import EvaluationCallback, metrics_of
 
 __all__ = [
     "EvaluationCallback",
@@ -40,14 +39,14 @@ __all__ = [
 ]
 
 _WHERE = {
-    "EvaluationCallback": "trials.training",
+    "EvaluationCallback": "evaluation.callback",
     "Platform": "platforms",
     "Rollout": "scenario",
     "Scenario": "scenario",
-    "TrialRow": "env.trial_row",
-    "evaluate": "trials.evaluation",
+    "TrialRow": "logs.row",
+    "evaluate": "evaluation.evaluate",
     "load_scenarios": "datasets",
-    "metrics_of": "trials.training",
+    "metrics_of": "evaluation.callback",
     "report": "analysis.make",
 }
 """Module of each name that is imported when it is asked for."""

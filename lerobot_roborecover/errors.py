@@ -19,6 +19,11 @@ class OptionError(RoboRecoverError, ValueError):
     """An option's value cannot be used; the message names it, the limit and the remedy."""
 
 
+class ScenarioError(RoboRecoverError, ValueError):
+    """A scenario, or a file that holds one, is not usable; the message says which field, the value and the
+    limit."""
+
+
 _REMEDIES = {
     errno.ENOSPC: "Make room on that disk, then run the command again",
     errno.EDQUOT: "Your quota of that disk is used up: make room, then run the command again",

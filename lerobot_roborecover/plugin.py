@@ -9,47 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
-from lerobot_roborecover.env import configs  # noqa: F401 - registers the env types
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.interventions import configuration_intervention, ema  # noqa: F401 - register types
-from lerobot_roborecover.interventions.detectors import register_detectors
-from lerobot_roborecover.interventions.monitor import register_monitors
+from lerobot_roborecover.evaluation import env_configs  # noqa: F401 - registers the env types
 from lerobot_roborecover.platforms.base import ENV_PREFIX
-from lerobot_roborecover.remote import configuration_remote  # noqa: F401 - registers the policy
-from lerobot_roborecover.signals import Terminated, handle, raise_terminated
+from lerobot_roborecover.policies import ema  # noqa: F401 - register types
+from lerobot_roborecover.policies.command_line import rewrite_env_argument
+from lerobot_roborecover.policies.detectors import register_detectors
+from lerobot_roborecover.policies.detectors.monitor import register_monitors
+from lerobot_roborecover.policies.remote import configuration_remote  # noqa: F401 - registers the policy
+from lerobot_roborecover.utils.signals import Terminated, handle, raise_terminated
 
 register_monitors()
 register_detectors()
-
-
-def rewrite_env_argument(argv: list[str]) -> list[str]:
-    """Reads `--env roborecover_…` as `--env.type=roborecover_…`.
-
-    LeRobot's parser (draccus) refuses a bare name for a choice class. Only our own names, and only the
-    argument list, are touched.
-
-    Args:
-        argv: a command line, program name first.
-
-    Returns:
-        The command line to parse instead.
-    """
-    out = argv[:1]
-    index = 1
-    while index < len(argv):
-        argument = argv[index]
-        value = None
-        if argument == "--env" and index + 1 < len(argv):
-            value = argv[index + 1]
-        elif argument.startswith("--env="):
-            value = argument.removeprefix("--env=")
-        if value is not None and value.startswith(ENV_PREFIX):
-            out.append(f"--env.type={value}")
-            index += 2 if argument == "--env" else 1
-        else:
-            out.append(argument)
-            index += 1
-    return out
 
 
 def plain_errors(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.errors import ScenarioError
 
 HANDOFF_TOLERANCE_M = 0.002
 """Largest end-effector or object displacement of a faithful handoff (paper, "Replay-Based Data Checking")."""
@@ -37,11 +37,6 @@ _ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_ID_CHARS - 1}}}")
 _SPLIT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _PLATFORM = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._,'()-]{0,255}")
-
-
-class ScenarioError(RoboRecoverError, ValueError):
-    """A scenario, or a file that holds one, is not usable; the message says which field, the value and the
-    limit."""
 
 
 def is_id(value: object) -> bool:

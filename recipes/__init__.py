@@ -1,5 +1,5 @@
 """How the shipped sets, policies and studies were made: run from a clone, not installed."""
 
-from lerobot_roborecover.rounding import pin_rounding
+from lerobot_roborecover.utils.determinism import pin_blas_kernels
 
-pin_rounding()  # before anything here imports numpy
+pin_blas_kernels()  # before anything here imports numpy

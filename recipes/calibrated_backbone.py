@@ -51,7 +51,7 @@ def main() -> None:
     from lerobot.utils.random_utils import set_seed
     from torch.utils.data import default_collate
 
-    from lerobot_roborecover.whole import new_folder
+    from lerobot_roborecover.utils.atomic_io import atomic_dir
 
     config = draccus.parse(TrainPipelineConfig)
     if config.policy is None or config.output_dir is None:
@@ -64,7 +64,7 @@ def main() -> None:
     batch = processors[0](default_collate([dataset[row] for row in rows]))
     pictures = torch.cat([batch[key] for key in config.policy.image_features])
     count = calibrate(policy.model.backbone, pictures)
-    with new_folder(config.output_dir) as folder:
+    with atomic_dir(config.output_dir) as folder:
         for part in (policy, *processors):
             part.save_pretrained(folder)
     print(f"{count} norms calibrated on {len(pictures)} pictures: {config.output_dir}", flush=True)

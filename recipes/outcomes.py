@@ -9,8 +9,8 @@ import gzip
 from collections.abc import Mapping
 from pathlib import Path
 
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 
 OUTCOMES = Path(__file__).parent / "outcomes"
 _SUFFIX = ".jsonl.gz"
@@ -28,7 +28,7 @@ def store_logs(logs: Mapping[str, Path], folder: Path) -> None:
     Raises:
         TrialLogError: a log is damaged.
     """
-    with new_folder(folder, replace=True) as made:
+    with atomic_dir(folder, replace=True) as made:
         made.mkdir()
         for name, log in logs.items():
             read_trial_log(log)

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.studio.line_process import LineProcess
-from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
-from lerobot_roborecover.studio.teleop.serve import TeleopConfig, serve
-from lerobot_roborecover.studio.teleop.write import recordings_folder
+from lerobot_roborecover.utils.journal import Journal
+from lerobot_roborecover.web.background_server import BackgroundServer
+from lerobot_roborecover.web.teleop.client import Client, TeleopRefusal
+from lerobot_roborecover.web.teleop.serve import TeleopConfig, serve
+from lerobot_roborecover.web.teleop.write import recordings_folder
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 
 OPERATOR = "scripted-operator"
@@ -128,7 +128,7 @@ def _place(config: TeleopConfig, number: int) -> str:
 @contextmanager
 def _server(config: TeleopConfig) -> Iterator[str]:
     """The server's address; interrupted at the end, it writes the dataset."""
-    with LineProcess("the teleoperation server", serve, config) as server:
+    with BackgroundServer("the teleoperation server", serve, config) as server:
         until, line = time.monotonic() + START_S, ""
         while "http://" not in line:
             line = server.hear(until) or ""

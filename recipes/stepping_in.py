@@ -26,7 +26,7 @@ from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Scenario
 from recipes.commands import evaluate, roborecover
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs

@@ -7,7 +7,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 from recipes.commands import program
 
 
@@ -64,7 +64,7 @@ class Training:
             subprocess.CalledProcessError: as `train`.
         """
         last = self.train()
-        with new_folder(result) as policy:
+        with atomic_dir(result) as policy:
             shutil.copytree(
                 last / "pretrained_model",
                 policy,

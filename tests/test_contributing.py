@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from lerobot_roborecover.remote.mapping import parse_mapping
+from lerobot_roborecover.policies.remote.mapping import parse_mapping
 from tests.support.trial_rows import three_policies
 
 ROOT = Path(__file__).parents[1]

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.cli.main import COMMANDS, main
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms.libero.assets import HUB_REVISION
 from lerobot_roborecover.platforms.robotwin.checkout import ASSETS_REVISION
 from tests.support.factories import fake_dataset, save_policy

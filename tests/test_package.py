@@ -23,7 +23,7 @@ def test_importing_the_package_is_light():
 
 def test_a_worker_needs_neither_lerobot_nor_torch():
     code = (
-        "from lerobot_roborecover.env import slot_server\n"
+        "from lerobot_roborecover.workers import slot_server\n"
         "from lerobot_roborecover.workers import jobs, worker\n"
         "from lerobot_roborecover.workers.messages import SlotConfig\n"
         "slot_server.SlotServer(SlotConfig('fake'))"
@@ -33,7 +33,7 @@ def test_a_worker_needs_neither_lerobot_nor_torch():
 
 def test_a_running_metaworld_worker_loads_neither_lerobot_nor_torch():
     code = (
-        "from lerobot_roborecover.env.slot_server import SlotServer\n"
+        "from lerobot_roborecover.workers.slot_server import SlotServer\n"
         "from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig\n"
         "from lerobot_roborecover import load_scenarios\n"
         "server = SlotServer(SlotConfig('metaworld', {'obs_type': 'state'}))\n"
@@ -61,5 +61,7 @@ def test_the_version_has_one_place():
     root = Path(__file__).parents[1]
     project = tomllib.loads((root / "pyproject.toml").read_text())
     assert "version" not in project["project"]
-    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "lerobot_roborecover.__version__"}
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {
+        "attr": "lerobot_roborecover._version.__version__"
+    }
     assert yaml.safe_load((root / "CITATION.cff").read_text())["version"] == __version__

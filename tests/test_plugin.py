@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.signals import Terminated
+from lerobot_roborecover.utils.signals import Terminated
 
 pytestmark = pytest.mark.lerobot
 

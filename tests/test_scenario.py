@@ -11,7 +11,7 @@ import pytest
 import lerobot_roborecover.scenario as records
 from lerobot_roborecover.curation.collect.starts import make_units
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_row import Protocol, make_row
+from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.platforms.starts import Starts
 from lerobot_roborecover.scenario import Outcome, Reset, Rollout, Scenario, ScenarioError, Task
 
@@ -81,7 +81,7 @@ def test_what_collect_rolls_out_has_no_labels():
     assert not isinstance(planned, Scenario)
     assert not hasattr(planned, "stage")
     row = make_row(
-        planned, Protocol("recovery", 0, "expert", 1, None), dataset="", dataset_revision=None, trial=0,
+        planned, EvalProtocol("recovery", 0, "expert", 1, None), dataset="", dataset_revision=None, trial=0,
         noise="", batch_size=1, outcome=Outcome.HORIZON, reason="", steps=60, handoff=None, sim_s=0.0,
         policy_s=0.0, actions_sha256="",
     )  # fmt: skip

@@ -1,35 +1,35 @@
-"""What is shown of the output of a program that failed."""
+"""Docs and docstrings keep to the field's words."""
 
 from __future__ import annotations
 
-import pytest
+import ast
+import re
+from pathlib import Path
 
-from lerobot_roborecover.words import output_end
-
-BAR = "Stepping through eval batches:  {n:2}%|##   | {n}/100 [00:01<00:09,  9.9it/s]"
-BARS = "\r".join(BAR.format(n=n) for n in range(60))
-
-
-@pytest.mark.parametrize(
-    ("output", "cause", "shown"),
-    [
-        (
-            f"{BARS}\nTraceback:\n  x = 1\npkg.LogError: in use\n{BARS}", "pkg.LogError: in use",
-            ["Traceback:", "  x = 1", "pkg.LogError: in use"],
-        ),
-        (
-            f"{BARS}ValueError: 3 [of 4]\nbye\n12it [00:01, 3.2it/s]", "ValueError: 3 [of 4]",
-            ["ValueError: 3 [of 4]", "bye"],
-        ),
-        ("a: no such option\n", "a: no such option", ["a: no such option"]),
-        ("Error: one\nKeyError: 'two'\n", "KeyError: 'two'", ["Error: one", "KeyError: 'two'"]),
-        (BARS, "", []),
-        ("", "", []),
-    ],
-)  # fmt: skip
-def test_the_end_of_an_output_is_its_cause_and_no_progress_bars(output, cause, shown):
-    assert output_end(output, 9) == (cause, "\n".join(f"  {line}" for line in shown))
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "lerobot_roborecover"
+WORDS = re.compile(r"\b(whoever|nobody|somebody|anybody|no say|has a say)\b", re.IGNORECASE)
+"""Words without a referent: name the policy, the user, the trial."""
 
 
-def test_only_so_many_lines_are_shown():
-    assert output_end("OSError: full\n1\n2\n3\n", 2) == ("OSError: full", "  2\n  3")
+def test_docstrings_name_what_they_speak_of():
+    found = []
+    for file in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                text = node.value.value
+                if isinstance(text, str) and (word := WORDS.search(text)):
+                    found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {word[0]}")
+    assert not found, "\n".join(found)
+
+
+def test_pages_name_what_they_speak_of():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    found = [
+        f"{page.relative_to(ROOT)}:{number}: {word[0]}"
+        for page in pages
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        if (word := WORDS.search(line))
+    ]
+    assert not found, "\n".join(found)

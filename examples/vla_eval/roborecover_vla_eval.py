@@ -29,16 +29,16 @@ from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.render import configure_mujoco_render
 from vla_eval.specs import DimSpec
 
-from lerobot_roborecover.env.configs import env_type
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS, digest_of
-from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial import Act, Trial
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.remote.errors import RemoteError
-from lerobot_roborecover.remote.mapping import load_mapping
-from lerobot_roborecover.remote.modeling_remote import split
-from lerobot_roborecover.remote.translate import Translator
+from lerobot_roborecover.evaluation.env_configs import env_type
+from lerobot_roborecover.evaluation.session import create_session
+from lerobot_roborecover.evaluation.trial import Act, Trial
+from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS, digest_of
+from lerobot_roborecover.policies.metadata import PolicyMetadata
+from lerobot_roborecover.policies.remote.errors import RemoteError
+from lerobot_roborecover.policies.remote.mapping import load_mapping
+from lerobot_roborecover.policies.remote.modeling_remote import split
+from lerobot_roborecover.policies.remote.translate import Translator
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +52,8 @@ class RecoveryBenchmark(StepBenchmark):
 
     Args:
         platform: `libero`, `metaworld`, `robotwin`, or another installed one.
-        mapping: of `lerobot_roborecover/remote/mappings`, or a YAML file's path; with `protocol: vla_eval`.
+        mapping: of `lerobot_roborecover/policies/remote/mappings`, or a YAML file's path; with
+            `protocol: vla_eval`.
         policy: the policy's name in trial rows.
         trial_log: file of trial rows; `{pid}` becomes the process's number. Default: a new one in
             `outputs/`.
@@ -96,8 +97,8 @@ class RecoveryBenchmark(StepBenchmark):
             "flags": [send_wrist_image, send_state, quat_no_antipodal],
             UNKNOWN_WEIGHTS: "not known",
         }
-        facts = RunFacts(policy, "vla_eval", execution_horizon=1, policy_settings=settings)
-        scenarios, self._run = open_run(options, options.run_spec(), workers=workers, facts=facts)
+        facts = PolicyMetadata(policy, "vla_eval", execution_horizon=1, policy_settings=settings)
+        scenarios, self._run = create_session(options, options.run_spec(), workers=workers, facts=facts)
         self._scenarios = {s.id: s for s in scenarios}
         self._env_pre, self._env_post = options.get_env_processors()
         self._run.pool.acquire()
@@ -232,7 +233,7 @@ class RecoveryBenchmark(StepBenchmark):
     def _after(self, trial: Trial) -> dict[str, Any]:
         """The observation; a trial that is over becomes a row first."""
         if trial.outcome is not None:
-            if self._run.kept_log().find(trial.key) is None:
+            if self._run.require_log().find(trial.key) is None:
                 self._run.record(trial, noise="unseeded", batch_size=1)
             else:
                 logger.warning("%s trial %d is in the trial log already", trial.scenario.id, trial.index)

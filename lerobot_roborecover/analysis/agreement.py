@@ -16,7 +16,7 @@ MARGIN = 0.10
 """A loss that a comparison has to be able to show before it counts as agreement."""
 
 
-class Standing(StrEnum):
+class AgreementVerdict(StrEnum):
     """What may be said of a rate beside a published one."""
 
     AGREES = "agrees"
@@ -37,7 +37,7 @@ class ScoreAgreement:
     """Its bounds are NaN where none were published; it is then taken as exact."""
     difference: Estimate
     """Measured less published."""
-    standing: Standing
+    standing: AgreementVerdict
 
 
 def agreement(measured: Estimate, published: Estimate | None, margin: float = MARGIN) -> ScoreAgreement:
@@ -53,7 +53,7 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
     """
     nothing = Estimate(math.nan, math.nan, math.nan)
     if published is None or math.isnan(measured.low):
-        return ScoreAgreement(measured, published or nothing, nothing, Standing.UNPUBLISHED)
+        return ScoreAgreement(measured, published or nothing, nothing, AgreementVerdict.UNPUBLISHED)
     low, high = (_or(bound, published.value) for bound in (published.low, published.high))
     value = measured.value - published.value
     difference = Estimate(
@@ -62,11 +62,11 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
         value + math.hypot(measured.high - measured.value, published.value - low),
     )
     if difference.high < 0:
-        standing = Standing.LOWER
+        standing = AgreementVerdict.LOWER
     elif difference.low > 0:
-        standing = Standing.HIGHER
+        standing = AgreementVerdict.HIGHER
     else:
-        standing = Standing.AGREES if difference.low > -margin else Standing.UNDECIDED
+        standing = AgreementVerdict.AGREES if difference.low > -margin else AgreementVerdict.UNDECIDED
     return ScoreAgreement(measured, published, difference, standing)
 
 

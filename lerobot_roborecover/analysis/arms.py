@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.extent import Missing, missing
 from lerobot_roborecover.analysis.labels import settings_differences
-from lerobot_roborecover.analysis.sequential_record import SequentialRecord
-from lerobot_roborecover.env.policy_settings import settings_of_method
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.extent import Missing, missing
+from lerobot_roborecover.logs.policy_settings import settings_of_method
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.sequential_record import SequentialRecord
 from lerobot_roborecover.scenario import Start
 
 

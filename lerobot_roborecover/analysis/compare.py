@@ -201,14 +201,14 @@ def _methods(results: Results, a: str, b: str) -> tuple[tuple[MethodRate, Method
         return None
     for c in results.method_contrasts:
         if {c.these_runs.a, c.these_runs.b} == {a, b}:
-            return both, c if c.these_runs.a == a else c.turned()
+            return both, c if c.these_runs.a == a else c.reversed()
     raise AssertionError("every pair of policies has a contrast")
 
 
 def _initial(results: Results, a: str, b: str) -> Contrast | None:
     for c in results.initial_contrasts:
         if {c.a, c.b} == {a, b} and c.scenarios:
-            return c if c.a == a else c.turned()
+            return c if c.a == a else c.reversed()
     return None
 
 

@@ -50,7 +50,7 @@ class Contrast:
         """What may be said of the two."""
         return verdict(self)
 
-    def turned(self) -> Contrast:
+    def reversed(self) -> Contrast:
         """The same, b minus a."""
         d = self.difference
         return replace(self, a=self.b, b=self.a, difference=Estimate(-d.value, -d.high, -d.low))

@@ -16,8 +16,8 @@ import numpy as np
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
-from lerobot_roborecover.env.trial_log import TrialLogError
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import TrialLogError
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _NOBODY = Estimate(_NAN, _NAN, _NAN)
 
 
 @dataclass(frozen=True)
-class Halves:
+class SplitHalves:
     """Rates in two halves of every scenario's trials, for S random divisions."""
 
     choosing: np.ndarray
@@ -34,7 +34,7 @@ class Halves:
     """(S, P, N) in [0, 1] on the other half."""
 
 
-def halves(successes: np.ndarray, trials: np.ndarray, seed: int) -> Halves:
+def halves(successes: np.ndarray, trials: np.ndarray, seed: int) -> SplitHalves:
     """Divides trials at random; every division is there in both directions.
 
     Args:
@@ -48,10 +48,10 @@ def halves(successes: np.ndarray, trials: np.ndarray, seed: int) -> Halves:
     with np.errstate(invalid="ignore", divide="ignore"):
         some = np.where(small > 0, first / small, np.nan)
         rest = np.where(small > 0, (successes - first) / (trials - small), np.nan)
-    return Halves(np.concatenate([some, rest]), np.concatenate([rest, some]))
+    return SplitHalves(np.concatenate([some, rest]), np.concatenate([rest, some]))
 
 
-def dealt(successes: np.ndarray, trials: np.ndarray, seed: int) -> np.ndarray:
+def permutation_null(successes: np.ndarray, trials: np.ndarray, seed: int) -> np.ndarray:
     """(S, P, N) rates had the trials of every scenario been dealt to the policies at random: all policies
     alike."""
     rng = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def oracle(panel: Panel, resampling: Resampling) -> Oracle:
         chosen, always = _choose(halves(panel.successes, panel.trials, resampling.seed))
         rate, fixed = resampling.rates(np.stack([chosen, always], 1))
         (gain,) = resampling.differences((chosen - always)[:, None])
-    by_chance = _hindsight_gain(dealt(panel.successes, panel.trials, resampling.seed))
+    by_chance = _hindsight_gain(permutation_null(panel.successes, panel.trials, resampling.seed))
     lost = tuple(s.id for s, total in zip(panel.scenarios, panel.successes.sum(0), strict=True) if not total)
     return Oracle(
         len(panel.scenarios), panel.arms[best], best_rate, rate, fixed, gain, hindsight, hindsight_gain,
@@ -110,7 +110,7 @@ def oracle(panel: Panel, resampling: Resampling) -> Oracle:
     )  # fmt: skip
 
 
-def _choose(found: Halves) -> tuple[np.ndarray, np.ndarray]:
+def _choose(found: SplitHalves) -> tuple[np.ndarray, np.ndarray]:
     """(N,) rates of the policy chosen by scenario, and of the one chosen for all, over all divisions.
 
     Where several are level on a scenario, the one that is best on all of them is taken.
@@ -167,7 +167,7 @@ def profile_difference(panel: Panel, a: int, b: int, resampling: Resampling) -> 
     estimate, floor = _NOBODY, _NOBODY
     successes, trials = panel.successes[[a, b]][:, known], panel.trials[[a, b]][:, known]
     if len(d):
-        by_chance = dealt(successes, trials, resampling.seed)
+        by_chance = permutation_null(successes, trials, resampling.seed)
         floor = _range(np.abs(by_chance[:, 0] - by_chance[:, 1]).mean(1), resampling.level)
     if len(d) and (trials >= 2).all():
         parts = halves(successes, trials, resampling.seed)

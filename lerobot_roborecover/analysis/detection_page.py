@@ -28,8 +28,8 @@ from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import Figure, png_of, svg_of
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_csv, to_latex, to_markdown, to_text
-from lerobot_roborecover.outputs import claim_page
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 SCHEMA_VERSION = 1
 NUMBERS_FILE, SCORES_FOLDER = "detectors.json", "scores"
@@ -177,15 +177,15 @@ def write_detection_report(
     tables = [*_results(measured, pairs, alpha, level), input_table(measured)]
     with claim_page(out, DETECTION_FILES):
         for table in tables:
-            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
-            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
-        write_whole(out / "detectors.md", "\n".join(map(to_markdown, tables)))
+            atomic_write(out / "tables" / f"{table.name}.csv", to_csv(table))
+            atomic_write(out / "tables" / f"{table.name}.tex", to_latex(table))
+        atomic_write(out / "detectors.md", "\n".join(map(to_markdown, tables)))
         reports = {m.name: m.report for m in measured}
         figures = detection_figures(reports)
         films = [strip_figure(strip, scored, reports, seed) for strip in strips]
         for figure in [*figures, *films]:
-            write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
-            write_whole(out / f"{figure.name}.png", png_of(figure.plot))
+            atomic_write(out / f"{figure.name}.svg", svg_of(figure.plot))
+            atomic_write(out / f"{figure.name}.png", png_of(figure.plot))
         for name, trials in scored.items():
             write_scores(out / SCORES_FOLDER / f"{name}.npz", trials)
         numbers = {
@@ -198,12 +198,12 @@ def write_detection_report(
             "detectors": {m.name: detector_json(m) for m in measured},
             "pairs": [_pair_json(c) for c in pairs],
         }
-        write_whole(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
+        atomic_write(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
         page = render_page(
             "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
             pictures=_pictures(figures), films=_pictures(films),
         )  # fmt: skip
-        write_whole(out / "detectors.html", page)
+        atomic_write(out / "detectors.html", page)
         return out / "detectors.html"
 
 

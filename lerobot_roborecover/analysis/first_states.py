@@ -13,10 +13,10 @@ from pathlib import Path
 
 from lerobot_roborecover.datasets.load import HUB_ID, builtin_names, load_scenarios
 from lerobot_roborecover.datasets.read import read_with_manifest
-from lerobot_roborecover.env.trial_log import ReadLog
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import ReadLog
 from lerobot_roborecover.scenario import Scenario, ScenarioError, Start
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 type _Found = dict[str, str]
 """First states by the content hash of their scenarios."""
@@ -47,7 +47,7 @@ def with_first_states(logs: Sequence[ReadLog]) -> tuple[list[ReadLog], list[str]
     if not unknown:
         return filled, []
     return filled, [
-        f"the logs do not say which first state {counted(unknown, 'scenario')} branch off from, and their "
+        f"the logs do not say which first state {pluralize(unknown, 'scenario')} branch off from, and their "
         "set is not on this machine: each counts as a first state of its own, so that intervals of initial-"
         "state rates, and retention, may be too narrow. Run the initial-state trials again, or put the set "
         "where the rows name it"

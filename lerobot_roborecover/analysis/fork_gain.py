@@ -26,7 +26,7 @@ from lerobot_roborecover.analysis.units import (
     initial_unit,
     unit_labels,
 )
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, ScenarioError, Start
 
 FORK = "fork"

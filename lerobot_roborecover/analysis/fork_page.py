@@ -9,8 +9,8 @@ from lerobot_roborecover.analysis.fork_gain import ForkGains, gain_tables
 from lerobot_roborecover.analysis.page import picture, render_page
 from lerobot_roborecover.analysis.style import render
 from lerobot_roborecover.analysis.tables import Table, to_csv, to_markdown
-from lerobot_roborecover.outputs import claim_page
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 PAGE = "gain.html"
 
@@ -29,16 +29,16 @@ def write_gains(gains: ForkGains, out: Path, command: str) -> list[Table]:
     tables, figure = gain_tables(gains), gain_by_step(gains)
     with claim_page(out, (PAGE, "gain.md", "fork_gain.svg", "fork_gain.png")):
         svg, png = render(figure)
-        write_whole(out / "fork_gain.svg", svg)
-        write_whole(out / "fork_gain.png", png)
+        atomic_write(out / "fork_gain.svg", svg)
+        atomic_write(out / "fork_gain.png", png)
         for table in tables:
-            write_whole(out / f"{table.name}.csv", to_csv(table))
-        write_whole(out / "gain.md", "\n".join(map(to_markdown, tables)))
+            atomic_write(out / f"{table.name}.csv", to_csv(table))
+        atomic_write(out / "gain.md", "\n".join(map(to_markdown, tables)))
         about = {"Made by": command, "Exactness": reproduced_text(gains)}
         page = render_page(
             "tables_figures.html.j2", title="Forks", about=about, pictures=[picture(figure)], tables=tables
         )
-        write_whole(out / PAGE, page)
+        atomic_write(out / PAGE, page)
         return tables
 
 

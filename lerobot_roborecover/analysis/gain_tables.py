@@ -75,7 +75,7 @@ def inversions(results: Results) -> Table:
             continue
         ahead = pair.initial.difference.value > 0
         first, second, first_over, second_over = (
-            c if ahead else c.turned() for c in (pair.initial, pair.recovery, over.initial, over.recovery)
+            c if ahead else c.reversed() for c in (pair.initial, pair.recovery, over.initial, over.recovery)
         )
         rows.append(
             (

@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 SIGNS = {"success": "●", "failure": "○", "invalid": "!"}

@@ -12,7 +12,7 @@ from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.soundness import invalid_words, valid_trials
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 
 def headline(results: Results) -> str:
@@ -34,7 +34,7 @@ def headline(results: Results) -> str:
     if lost and not math.isnan(reached):
         as_what = "counts as a failure" if lost == 1 else "count as failures"
         sentences.append(
-            f"{counted(lost, 'trial')} of it ended with a simulator or a machine and {as_what}; without, "
+            f"{pluralize(lost, 'trial')} of it ended with a simulator or a machine and {as_what}; without, "
             f"{100 * reached:.1f} %."
         )
     if results.several_runs:

@@ -43,18 +43,18 @@ def read_board(dataset_id: str) -> list[HubResult]:
     """
     from huggingface_hub import HfApi
 
-    from lerobot_roborecover.datasets.retries import again
+    from lerobot_roborecover.datasets.retries import retry
 
     if not HUB_ID.fullmatch(dataset_id):
         raise RowsError(f"{dataset_id!r:.120} is no data set on the Hub; write it like org/name")
     api, where = HfApi(), f"Hub dataset {dataset_id}"
     # Fine-tuned models are what is evaluated here; the Hub leaves them out unless asked.
-    ranked = again(
+    ranked = retry(
         lambda: api.get_dataset_leaderboard(dataset_id, base_model_only=False), f"{where}: its leaderboard"
     )
     found: list[HubResult] = []
     for place in {entry.model_id: entry for entry in ranked}.values():
-        info = again(
+        info = retry(
             lambda model=place.model_id: api.model_info(model, expand=["evalResults"]),
             f"Hub model {place.model_id}",
         )

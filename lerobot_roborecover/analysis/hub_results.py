@@ -165,14 +165,14 @@ def offer_results(repo_id: str, files: Mapping[str, bytes | Path]) -> str:
     """
     from huggingface_hub import CommitOperationAdd, HfApi
 
-    from lerobot_roborecover.datasets.retries import again
+    from lerobot_roborecover.datasets.retries import retry
 
     where = f"Hub model {repo_id}"
     operations = [
         CommitOperationAdd(path, str(content) if isinstance(content, Path) else content)
         for path, content in files.items()
     ]
-    commit = again(
+    commit = retry(
         lambda: HfApi().create_commit(
             repo_id,
             operations,

@@ -54,7 +54,7 @@ UNDEFINED = Estimate(float("nan"), float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
-class Spread:
+class WeightedMean:
     """Weighted means and how well their units pin them down: numbers of one column, arrays of several."""
 
     value: float | np.ndarray
@@ -75,7 +75,7 @@ def spread(
     *,
     cells: Sequence[str] | np.ndarray | None = None,
     weights: np.ndarray | None = None,
-) -> Spread:
+) -> WeightedMean:
     """The means of scenarios' values, and their variances over units.
 
     Args:
@@ -126,7 +126,7 @@ def spread(
         # Within cells the residuals are corrected already; whole units ask for it where they span scenarios.
         bessel = np.where(count == n, 1.0, bessel)
     variance = np.where(count > 1, bessel * (total**2).sum(-1, keepdims=True) + lacking, np.nan)
-    return Spread(
+    return WeightedMean(
         _plain(np.where(count > 0, value, np.nan)),
         _plain(variance),
         _plain(count),
@@ -136,7 +136,7 @@ def spread(
     )
 
 
-def jackknife(value: np.ndarray | float, left_out: np.ndarray, weights: np.ndarray) -> Spread:
+def jackknife(value: np.ndarray | float, left_out: np.ndarray, weights: np.ndarray) -> WeightedMean:
     """How well units pin down a number that is no mean: it is worked out again with each unit left out (Tukey
     1958).
 
@@ -154,7 +154,7 @@ def jackknife(value: np.ndarray | float, left_out: np.ndarray, weights: np.ndarr
     w = _over(w, w.sum(-1, keepdims=True))
     squares = (w**2).sum(-1, keepdims=True)
     freedom = _over(squares**2, (w**4).sum(-1, keepdims=True)) - 1
-    return Spread(
+    return WeightedMean(
         _plain(np.asarray(value, float)[..., None]),
         _plain(np.where(count > 1, variance, np.nan)),
         _plain(count),
@@ -209,7 +209,7 @@ def estimates_of(values: float | np.ndarray, bounds: Bounds) -> list[Estimate]:
     return [Estimate(*parts) for parts in zip(*columns, strict=True)]
 
 
-def rate_interval(found: Spread, level: float = LEVEL) -> Bounds:
+def rate_interval(found: WeightedMean, level: float = LEVEL) -> Bounds:
     """Interval of a mean of numbers from 0 to 1: Agresti-Coull with the effective number of units, or
     Clopper-Pearson where all units are 0 or all are 1.
 
@@ -234,7 +234,7 @@ def rate_interval(found: Spread, level: float = LEVEL) -> Bounds:
     return _bounds(found, low, high)
 
 
-def _all_alike(found: Spread, chance: float) -> np.ndarray:
+def _all_alike(found: WeightedMean, chance: float) -> np.ndarray:
     """(...) the largest mean rate at which all units fail together with the given chance, whatever the rates
     of the units: 1 - chance ** (1 / n) of n units that weigh the same, which is Clopper and Pearson's bound.
 
@@ -251,7 +251,7 @@ def _all_alike(found: Spread, chance: float) -> np.ndarray:
     return np.where(allowed, w.cumsum(-1) - number * common, 0.0).max(-1, initial=0.0)
 
 
-def difference_interval(found: Spread, level: float = LEVEL) -> Bounds:
+def difference_interval(found: WeightedMean, level: float = LEVEL) -> Bounds:
     """Interval of a mean of paired differences of rates, numbers from -1 to 1.
 
     Returns:
@@ -262,7 +262,7 @@ def difference_interval(found: Spread, level: float = LEVEL) -> Bounds:
     return _bounds(found, np.maximum(centre - half, -1.0), np.minimum(centre + half, 1.0))
 
 
-def difference_p(found: Spread) -> float:
+def difference_p(found: WeightedMean) -> float:
     """Two-sided p-value of that interval, of one column: 1 less the level at which it begins to hold zero;
     NaN for fewer than two units."""
     centre, error, freedom = (float(x) for x in _one_unit_more(found))
@@ -271,7 +271,7 @@ def difference_p(found: Spread) -> float:
     return float(2 * special.stdtr(freedom, -abs(centre) / error))
 
 
-def _one_unit_more(found: Spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _one_unit_more(found: WeightedMean) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Differences with one unit more, half of it won by each side; their standard errors, and degrees of
     freedom."""
     d, variance, count, n, freedom = _arrays(found)
@@ -325,7 +325,7 @@ def ratio_interval(
     return _bounds(first, np.where(bounded, np.maximum(low, 0.0), np.nan), np.where(bounded, high, np.nan))
 
 
-def _arrays(found: Spread) -> tuple[np.ndarray, ...]:
+def _arrays(found: WeightedMean) -> tuple[np.ndarray, ...]:
     of = (found.value, found.variance, found.units, found.effective, found.freedom)
     return tuple(np.asarray(values, float) for values in of)
 
@@ -334,7 +334,7 @@ def _quantile(level: float, freedom: float | np.ndarray) -> np.ndarray:
     return special.stdtrit(freedom, 0.5 + level / 2)
 
 
-def _bounds(found: Spread, low: np.ndarray, high: np.ndarray) -> Bounds:
+def _bounds(found: WeightedMean, low: np.ndarray, high: np.ndarray) -> Bounds:
     """NaN where there are fewer than two units."""
     enough = np.asarray(found.units) > 1
     low, high = (clean(np.where(enough, bound, np.nan)) for bound in (low, high))

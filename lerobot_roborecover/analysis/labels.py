@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lerobot_roborecover.env.policy_settings import digest_of
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.row import TrialRow
 
 _NOT_RECORDED = "settings not recorded"
 _SHOWN = 3

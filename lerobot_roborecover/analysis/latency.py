@@ -22,7 +22,7 @@ from lerobot_roborecover.analysis.style import (
     short,
 )
 from lerobot_roborecover.analysis.tables import Column, Table
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Start
 
 MEASURED = float("nan")

@@ -30,14 +30,14 @@ from lerobot_roborecover.analysis.panel import Panel, make_panel
 from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.runs import method_rate, run_rates
-from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.env.log_file import LOG_SUFFIXES
-from lerobot_roborecover.env.policy_settings import settings_of_method
-from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
+from lerobot_roborecover.logs.policy_settings import settings_of_method
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.logs.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.scenario import Start
 
 LEADERBOARD_SCHEMA = 1
@@ -365,7 +365,7 @@ def _board(
 
 
 def _of_the_best(contrast: Contrast, best_is_a: bool) -> ComparisonVerdict:
-    return contrast.verdict if best_is_a else contrast.turned().verdict
+    return contrast.verdict if best_is_a else contrast.reversed().verdict
 
 
 def _place(p: int, ranked: list[int], between: dict[tuple[int, int], Contrast]) -> tuple[int, int]:

@@ -12,8 +12,8 @@ from lerobot_roborecover.analysis.macro import MACRO_9
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.outputs import claim_page
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 
 def write_leaderboard(
@@ -40,7 +40,7 @@ def write_leaderboard(
     files = out / "index.html", out / "leaderboard.json"
     with claim_page(out, [path.name for path in files]):
         for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
-            write_whole(path, text)
+            atomic_write(path, text)
         return files
 
 

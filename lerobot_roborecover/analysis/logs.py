@@ -25,11 +25,11 @@ from lerobot_roborecover.analysis.fork_gain import FORK
 from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
 from lerobot_roborecover.analysis.look_alikes import check_names
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
-from lerobot_roborecover.analysis.sequential_record import SequentialRecord, read_record
-from lerobot_roborecover.env.log_file import LOG_SUFFIXES
-from lerobot_roborecover.env.policy_settings import UNKNOWN_WEIGHTS
-from lerobot_roborecover.env.trial_log import ReadLog, TrialLogError, read_log
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
+from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.sequential_record import SequentialRecord, read_record
+from lerobot_roborecover.logs.trial_log import ReadLog, TrialLogError, read_log
 from lerobot_roborecover.scenario import Start
 
 _FIXED_BY_SCENARIO = (

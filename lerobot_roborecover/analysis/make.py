@@ -18,7 +18,7 @@ from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.report import REPORT_FILES, Extras, ReportFiles, write_report
 from lerobot_roborecover.analysis.results import Options, Results, analyse
 from lerobot_roborecover.analysis.tables import to_text
-from lerobot_roborecover.outputs import check_page
+from lerobot_roborecover.utils.outputs import check_page
 
 
 @dataclass(frozen=True)

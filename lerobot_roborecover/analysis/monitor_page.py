@@ -32,8 +32,8 @@ from lerobot_roborecover.analysis.style import (
     svg_of,
 )
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown, to_text
-from lerobot_roborecover.outputs import claim_page
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 TITLES = {
     "accuracy": "Acc.",
@@ -199,13 +199,13 @@ def write_monitor_report(
     tables = [metrics_table(measured, level), confusion_table(measured), episode_table(measured)]
     with claim_page(out, MONITOR_FILES):
         for table in tables:
-            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table))
-            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table))
-        write_whole(out / "monitor.md", "\n".join(map(to_markdown, tables)))
+            atomic_write(out / "tables" / f"{table.name}.csv", to_csv(table))
+            atomic_write(out / "tables" / f"{table.name}.tex", to_latex(table))
+        atomic_write(out / "monitor.md", "\n".join(map(to_markdown, tables)))
         pictures = []
         for figure in figures(measured):
-            write_whole(out / f"{figure.name}.svg", svg_of(figure.plot))
-            write_whole(out / f"{figure.name}.png", png_of(figure.plot))
+            atomic_write(out / f"{figure.name}.svg", svg_of(figure.plot))
+            atomic_write(out / f"{figure.name}.png", png_of(figure.plot))
             pictures.append(picture(figure))
         for m in measured:
             _write_frames(out / "frames" / f"{m.name}.csv", m.frames)
@@ -216,11 +216,11 @@ def write_monitor_report(
             "level": level,
             "datasets": {m.name: to_json(m.report) for m in measured},
         }
-        write_whole(out / "metrics.json", json.dumps(numbers, indent=1, default=str) + "\n")
+        atomic_write(out / "metrics.json", json.dumps(numbers, indent=1, default=str) + "\n")
         page = render_page(
             "tables_figures.html.j2", title="Recovery monitor", about=about, pictures=pictures, tables=tables
         )
-        write_whole(out / "monitor.html", page)
+        atomic_write(out / "monitor.html", page)
         return out / "monitor.html"
 
 

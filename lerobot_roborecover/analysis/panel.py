@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_roborecover.analysis.arms import Arm
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.units import ResamplingUnit, default_unit, unit_labels
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage
 
 CELLS = tuple(f"{stage.value}-{deviation.value}" for stage in Stage for deviation in DeviationType)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.workers.jobs import Done, JobPool, Raised, simulator_of_worker
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.workers.jobs import Done, JobError, JobPool, simulator_of_worker
 
 SIZE = 240
 """Width and height of a frame, pixels."""
@@ -40,8 +40,8 @@ def _render(scenarios: Sequence[Scenario], files: dict[str, Path]) -> str:
     with JobPool(scenarios[0].platform, options, _WORKERS, limit_s=_TIMEOUT_S) as pool:
         for scenario, outcome in pool.outcomes(_frame, scenarios, lambda s: (s,)):
             if isinstance(outcome, Done):
-                write_whole(files[scenario.id], outcome.value)
-            elif isinstance(outcome, Raised):
+                atomic_write(files[scenario.id], outcome.value)
+            elif isinstance(outcome, JobError):
                 problem = problem or f"{scenario.id}: {outcome.words}"
             else:
                 return (
@@ -59,7 +59,7 @@ def _frame(scenario: Scenario) -> bytes:
     """
     from PIL import Image
 
-    from lerobot_roborecover.replay import hand_off
+    from lerobot_roborecover.replay.handoff import hand_off
 
     simulator = simulator_of_worker()
     hand_off(simulator, scenario, check=False)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_roborecover.analysis.power import Guess, Plan, detectable
+from lerobot_roborecover.analysis.power import Plan, PowerAssumptions, detectable
 from lerobot_roborecover.analysis.style import (
     DASHES,
     LINE,
@@ -22,7 +22,9 @@ from lerobot_roborecover.analysis.style import (
 from lerobot_roborecover.analysis.tables import Column, Table
 
 
-def plan_table(plans: Sequence[Plan], guess: Guess, wanted: float, level: float, family: int) -> Table:
+def plan_table(
+    plans: Sequence[Plan], guess: PowerAssumptions, wanted: float, level: float, family: int
+) -> Table:
     """What every difference takes, by trials a scenario."""
     rows = [
         (
@@ -47,7 +49,7 @@ def plan_table(plans: Sequence[Plan], guess: Guess, wanted: float, level: float,
 
 
 def detectable_table(
-    guess: Guess, scenarios: int, trials: Sequence[int], wanted: float, level: float, family: int
+    guess: PowerAssumptions, scenarios: int, trials: Sequence[int], wanted: float, level: float, family: int
 ) -> Table:
     """The least difference that a set can show, by trials a scenario."""
     rows = [(k, scenarios * k, detectable(guess, scenarios, k, wanted, level, family)) for k in trials]
@@ -64,7 +66,7 @@ def detectable_table(
     )
 
 
-def _believed(guess: Guess) -> str:
+def _believed(guess: PowerAssumptions) -> str:
     return (
         f"Believed: the worse policy solves {100 * guess.rate:.1f} %; the true rates of scenarios scatter by "
         f"{100 * guess.sd:.1f} points (SD) around it; those of the two policies correlate "
@@ -82,7 +84,7 @@ def _tested(level: float, family: int) -> str:
 
 
 def detectable_figure(
-    guess: Guess,
+    guess: PowerAssumptions,
     trials: Sequence[int],
     wanted: float,
     level: float,

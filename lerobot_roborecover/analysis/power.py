@@ -40,7 +40,7 @@ SIMULATED_UP_TO = 2000
 
 
 @dataclass(frozen=True)
-class Guess:
+class PowerAssumptions:
     """What is believed of two policies and of the scenarios."""
 
     rate: float
@@ -84,7 +84,7 @@ class Plan:
     """With the exact test, by simulation; NaN where there are too many scenarios."""
 
 
-def variance_of_difference(guess: Guess, difference: float, trials: int) -> float:
+def variance_of_difference(guess: PowerAssumptions, difference: float, trials: int) -> float:
     """Variance between scenarios of the observed paired difference.
 
     Args:
@@ -99,7 +99,12 @@ def variance_of_difference(guess: Guess, difference: float, trials: int) -> floa
 
 
 def power(
-    guess: Guess, difference: float, scenarios: float, trials: int, level: float = LEVEL, family: int = 1
+    guess: PowerAssumptions,
+    difference: float,
+    scenarios: float,
+    trials: int,
+    level: float = LEVEL,
+    family: int = 1,
 ) -> float:
     """Chance that the sign-flip test separates the two, by the formula above.
 
@@ -124,7 +129,12 @@ def power(
 
 
 def scenarios_for(
-    guess: Guess, difference: float, trials: int, wanted: float = POWER, level: float = LEVEL, family: int = 1
+    guess: PowerAssumptions,
+    difference: float,
+    trials: int,
+    wanted: float = POWER,
+    level: float = LEVEL,
+    family: int = 1,
 ) -> int | None:
     """Least number of scenarios with the wanted power; None where it is more than `MOST_SCENARIOS`."""
     if power(guess, difference, MOST_SCENARIOS, trials, level, family) < wanted:
@@ -138,7 +148,12 @@ def scenarios_for(
 
 
 def detectable(
-    guess: Guess, scenarios: int, trials: int, wanted: float = POWER, level: float = LEVEL, family: int = 1
+    guess: PowerAssumptions,
+    scenarios: int,
+    trials: int,
+    wanted: float = POWER,
+    level: float = LEVEL,
+    family: int = 1,
 ) -> float:
     """Least true difference that a set of scenarios separates with the wanted power; NaN where none does."""
     most = 1 - guess.rate - 1e-9
@@ -150,7 +165,7 @@ def detectable(
 
 
 def simulated_power(
-    guess: Guess,
+    guess: PowerAssumptions,
     difference: float,
     scenarios: int,
     trials: int,
@@ -177,7 +192,7 @@ def simulated_power(
 
 
 def true_rates(
-    rng: np.random.Generator, guess: Guess, difference: float, shape: tuple[int, int]
+    rng: np.random.Generator, guess: PowerAssumptions, difference: float, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """True rates of two policies on scenarios: beta-distributed, coupled by a normal copula whose correlation
     is chosen so that the rates' own is the guess's.
@@ -224,7 +239,7 @@ def _copula(table: Sequence[np.ndarray], wanted: float) -> float:
 
 
 def plans(
-    guess: Guess,
+    guess: PowerAssumptions,
     differences: Sequence[float],
     trials: Sequence[int],
     wanted: float = POWER,
@@ -254,7 +269,7 @@ def plans(
     return found
 
 
-def guess_from(panel: Panel, rate: float | None = None, correlation: float | None = None) -> Guess:
+def guess_from(panel: Panel, rate: float | None = None, correlation: float | None = None) -> PowerAssumptions:
     """What a pilot says: rate, scatter between scenarios net of the trials' own, and the two's correlation.
 
     The difference that the pilot shows is no part of it: to plan for that one says what is known already.
@@ -288,4 +303,4 @@ def guess_from(panel: Panel, rate: float | None = None, correlation: float | Non
         covariance = float(np.cov(panel.rates[:2, both])[0, 1]) if both.sum() > 1 else 0.0
         found = min(max(covariance / spread, 0.0), 1.0) if spread > 1e-9 else 0.0
     share = min(max(float(np.mean(shares)), 0.0), 1.0)
-    return Guess(own, math.sqrt(share * own * (1 - own)), found)
+    return PowerAssumptions(own, math.sqrt(share * own * (1 - own)), found)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.analysis.escape import markdown, markdown_alt
 from lerobot_roborecover.analysis.figures import all_figures
 from lerobot_roborecover.analysis.gallery import Card, TrialVideo, gallery_values, make_cards
@@ -22,8 +22,8 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.style import png_of
 from lerobot_roborecover.analysis.tables import Cell, Table, to_csv, to_latex, to_markdown
 from lerobot_roborecover.analysis.units import ESTIMAND
-from lerobot_roborecover.outputs import claim_page
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 REPORT_SCHEMA = 1
 REPORT_FILES = ("report.html", "report.md", "results.json", "figures", "tables")
@@ -104,24 +104,24 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
         images: dict[str, dict[str, str]] = {}
         for figure in all_figures(results):
             wide, narrow = drawn_as_svg(figure)
-            write_whole(out / "figures" / f"{figure.name}.svg", wide)
-            write_whole(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
+            atomic_write(out / "figures" / f"{figure.name}.svg", wide)
+            atomic_write(out / "figures" / f"{figure.name}.png", png_of(figure.plot))
             if narrow is not None:
-                write_whole(out / "figures" / f"{figure.name}_narrow.svg", narrow)
+                atomic_write(out / "figures" / f"{figure.name}_narrow.svg", narrow)
             images[figure.name] = picture(figure, (wide, narrow))
         for table in tables:
-            write_whole(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
-            write_whole(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
+            atomic_write(out / "tables" / f"{table.name}.csv", to_csv(table).encode())
+            atomic_write(out / "tables" / f"{table.name}.tex", to_latex(table).encode())
         provenance = provenance_of(results, extras.command)
-        write_whole(
+        atomic_write(
             out / "results.json",
             json.dumps(_as_json(results, tables, remarks, provenance), indent=1).encode(),
         )
-        write_whole(
+        atomic_write(
             out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode()
         )
         cards = make_cards(results.recovery, extras.frames, extras.clips, results.initial)
-        write_whole(
+        atomic_write(
             out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
         )
         return ReportFiles(out / "report.html", out / "report.md", out / "results.json", tuple(tables))

@@ -18,7 +18,7 @@ from lerobot_roborecover.analysis.intervals import (
     LEVEL,
     Bounds,
     Estimate,
-    Spread,
+    WeightedMean,
     clean,
     difference_interval,
     estimates_of,
@@ -81,13 +81,13 @@ class Resampling:
         values = np.divide(upper, lower, out=np.full(len(lower), np.nan), where=lower > 0)
         return estimates_of(values, ratio_interval(top.T, bottom.T, self.index, self.level))
 
-    def spread(self, values: np.ndarray, cells: np.ndarray | None = None) -> Spread:
+    def spread(self, values: np.ndarray, cells: np.ndarray | None = None) -> WeightedMean:
         """Of (..., N) values: one column of scenarios, or several."""
         return spread(values, self.index, cells=cells)
 
     def _columns(
         self,
-        interval: Callable[[Spread, float], Bounds],
+        interval: Callable[[WeightedMean, float], Bounds],
         values: np.ndarray,
         cells: np.ndarray | None = None,
         weights: np.ndarray | None = None,

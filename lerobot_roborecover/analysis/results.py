@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.compared import Compared, compared
+from lerobot_roborecover.analysis.complete_subset import Compared, compared
 from lerobot_roborecover.analysis.contrasts import Contrast, adjusted, contrasts
 from lerobot_roborecover.analysis.costs import InterventionCost, intervention_cost
 from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
@@ -27,13 +27,13 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
+from lerobot_roborecover.analysis.sequential_pairs import recorded_pairs, watched_pair
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
-from lerobot_roborecover.analysis.sequential_record import SequentialRecord
 from lerobot_roborecover.analysis.soundness import barred_arms
 from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.analysis.watched import recorded_pairs, watched_pair
 from lerobot_roborecover.errors import check_seed
+from lerobot_roborecover.logs.sequential_record import SequentialRecord
 from lerobot_roborecover.scenario import Start
 
 MOST_PAIRS = 120
@@ -222,7 +222,7 @@ class Results:
             if record is not None:
                 check_plan(record, self.options.planned)
                 found = watched_pair(panel, indices, level, recorded_plan(record, panel), record.level)
-                return found if indices == pair else found.turned()
+                return found if indices == pair else found.reversed()
         if not self.options.sequential:
             return None
         return watched_pair(panel, pair, level, self.sequential_plan(pair))
@@ -329,7 +329,7 @@ class Results:
             if (c.a, c.b) == (a, b):
                 return c
             if (c.a, c.b) == (b, a):
-                return c.turned()
+                return c.reversed()
         raise RowsError(
             f"{a} against {b} is no one question: policies are compared with policies, and an intervention "
             "with its own direct control (--baseline says which)"

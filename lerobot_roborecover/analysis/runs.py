@@ -28,7 +28,7 @@ from lerobot_roborecover.analysis.contrasts import Contrast, holm
 from lerobot_roborecover.analysis.intervals import (
     UNDEFINED,
     Estimate,
-    Spread,
+    WeightedMean,
     clean,
     difference_interval,
     difference_p,
@@ -77,11 +77,11 @@ class MethodContrast:
         """What may be said of the two methods."""
         return method_verdict(self)
 
-    def turned(self) -> MethodContrast:
+    def reversed(self) -> MethodContrast:
         """The same, b minus a."""
         d = self.difference
         turned = Estimate(-d.value, -d.high, -d.low)
-        return replace(self, these_runs=self.these_runs.turned(), runs=self.runs[::-1], difference=turned)
+        return replace(self, these_runs=self.these_runs.reversed(), runs=self.runs[::-1], difference=turned)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _noise(found: RunRates) -> float:
     return float(np.sqrt((within / k).sum())) / len(pooled)
 
 
-def crossed_spread(rates: np.ndarray, resampling: Resampling) -> Spread:
+def crossed_spread(rates: np.ndarray, resampling: Resampling) -> WeightedMean:
     """The mean of R runs on N scenarios, and its variance for other runs on other units.
 
     Args:
@@ -177,7 +177,7 @@ def crossed_spread(rates: np.ndarray, resampling: Resampling) -> Spread:
     return _crossed(units, [(runs, count - 1)], shared)
 
 
-def crossed_difference(a: np.ndarray, b: np.ndarray, resampling: Resampling) -> Spread:
+def crossed_difference(a: np.ndarray, b: np.ndarray, resampling: Resampling) -> WeightedMean:
     """The mean difference of two methods' runs on the same N scenarios, for other runs on other units.
 
     Args:
@@ -208,17 +208,19 @@ def _parts(rates: np.ndarray, resampling: Resampling) -> tuple[float, float, int
     return float(means.var(ddof=1)) / count, square * units / (count * y.shape[1] ** 2), count
 
 
-def _crossed(units: Spread, runs: Sequence[tuple[float, int]], shared: float) -> Spread:
+def _crossed(units: WeightedMean, runs: Sequence[tuple[float, int]], shared: float) -> WeightedMean:
     between = sum(v for v, _ in runs)
     if math.isnan(between) or math.isnan(units.variance):
-        return Spread(units.value, float("nan"), 0, 0.0, 0.0)
+        return WeightedMean(units.value, float("nan"), 0, 0.0, 0.0)
     variance = max(between + units.variance - shared, between, units.variance)
     parts = sum(v * v / f for v, f in runs) + units.variance**2 / units.freedom
     own = sum(f for _, f in runs)
     # One scenario of each run: so many trials are independent for other runs on other scenarios, and no more.
     apart = min(min(f for _, f in runs) + 1, int(units.units))
     freedom = min(variance**2 / parts if parts > 0 else units.freedom, CAUTION * own, units.freedom)
-    return Spread(units.value, variance, units.units, units.effective, freedom, np.full(apart, 1 / apart))
+    return WeightedMean(
+        units.value, variance, units.units, units.effective, freedom, np.full(apart, 1 / apart)
+    )
 
 
 def method_contrasts(

@@ -22,15 +22,15 @@ from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import Study
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.sequential import sequence
-from lerobot_roborecover.analysis.sequential_record import (
+from lerobot_roborecover.analysis.units import default_unit, unit_labels
+from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
+from lerobot_roborecover.datasets.load import load_scenarios
+from lerobot_roborecover.logs.sequential_record import (
     SequentialRecord,
     read_record,
     record_path,
     write_record,
 )
-from lerobot_roborecover.analysis.units import default_unit, unit_labels
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
-from lerobot_roborecover.datasets.load import load_scenarios
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from lerobot_roborecover.analysis.media import find_media
 from lerobot_roborecover.analysis.page import render_page
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.datasets.load import HUB_ID
-from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.outputs import claim_page
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import new_file, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_file, atomic_write
+from lerobot_roborecover.utils.outputs import claim_page
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
                 board=board,
                 **gallery_values(cards),
             )
-            write_whole(out / name, page)
+            atomic_write(out / name, page)
             remarks += [f"{board.dataset}: {problem}" for problem in problems]
         used = {policy for policy, _ in config.media}
         policies = {arm for trials in found.trials for arm in trials.recovery.arms}
@@ -74,7 +74,7 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
                 f"videos of {', '.join(sorted(used - policies))}: no policy of these logs is called so; "
                 f"there are {', '.join(sorted(policies))}"
             )
-        write_whole(out / "README.md", _card(config.title, found))
+        atomic_write(out / "README.md", _card(config.title, found))
         return remarks
 
 
@@ -92,7 +92,7 @@ def _frames(
     for scenario in chosen:
         if scenario.fingerprint and scenario.fingerprint.frames_png:
             path = f"{folder}/{scenario.id}.png"
-            write_whole(out / path, scenario.fingerprint.frames_png[-1])
+            atomic_write(out / path, scenario.fingerprint.frames_png[-1])
             files[scenario.id] = path
     todo = [s for s in chosen if s.id not in files]
     if not todo:
@@ -127,7 +127,7 @@ def _media(folders: Sequence[tuple[str, Path]], panel: Panel, out: Path) -> dict
         for scenario_id, path in find_media(folder, ids).items():
             target = f"media/{number}-{name}/{scenario_id}{path.suffix}"
             (out / target).parent.mkdir(parents=True, exist_ok=True)
-            with new_file(out / target) as fresh:
+            with atomic_file(out / target) as fresh:
                 shutil.copyfile(path, fresh)
             clips.setdefault(scenario_id, []).append(TrialVideo(policy, target))
     return clips

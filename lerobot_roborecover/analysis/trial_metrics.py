@@ -15,7 +15,7 @@ from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.panel import Panel
 from lerobot_roborecover.analysis.resampling import Resampling
 from lerobot_roborecover.analysis.tables import Column, Table
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 
 NONE = float("nan")
 """Value of a trial that a metric says nothing of."""

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.curation.annotation.annotators import PREFIX, is_automatic
     from lerobot_roborecover.curation.annotation.automatic import annotate
     from lerobot_roborecover.scenario import ScenarioError
-    from lerobot_roborecover.studio.annotate.serve import AnnotateConfig, serve
+    from lerobot_roborecover.web.annotate.serve import AnnotateConfig, serve
 
     reserved = [name for name in args.annotators if is_automatic(name)]
     if reserved:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lerobot_roborecover.rounding import pin_policy_kernels
+from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
 HELP = (
     "Build a scenario dataset from one YAML file: collect, annotate, agree, screen, validate, split, render."
@@ -31,11 +31,11 @@ def run(args: argparse.Namespace) -> int:
     pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     from lerobot_roborecover.curation.pipeline.check import check_build
     from lerobot_roborecover.curation.pipeline.config import read_config
-    from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting
+    from lerobot_roborecover.curation.pipeline.stages import AwaitingAnnotations, Pipeline
     from lerobot_roborecover.curation.pipeline.summary import write_summary
-    from lerobot_roborecover.curation.pipeline.work import Work
+    from lerobot_roborecover.curation.pipeline.work import StageRunners
     from lerobot_roborecover.curation.render import publish_next
-    from lerobot_roborecover.words import next_line
+    from lerobot_roborecover.utils.text import next_command
 
     config = read_config(args.config)
     if problems := check_build(config):
@@ -43,11 +43,11 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.config} cannot be built, and nothing was run:\n{listed}", file=sys.stderr)
         if not args.dry_run:
             return 2
-    chain = Chain(config, Work(), lambda line: print(line, flush=True))
+    chain = Pipeline(config, StageRunners(), lambda line: print(line, flush=True))
     waiting = ""
     try:
         done = chain.build(args.first, args.until, args.dry_run)
-    except Waiting as err:
+    except AwaitingAnnotations as err:
         waiting, done = str(err), []
     if args.dry_run:
         return 2 if problems else 0
@@ -57,5 +57,5 @@ def run(args: argparse.Namespace) -> int:
         print(f"\nstopped: {waiting}")
         return 1
     if config.publish is None and not args.until:
-        print("\n" + next_line(publish_next(chain.places.result), "to publish"))
+        print("\n" + next_command(publish_next(chain.places.result), "to publish"))
     return 0

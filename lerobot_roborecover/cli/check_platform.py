@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         raise OptionError(f"--steps={args.steps}: 2 to 100000")
     if not isinstance(args.options, dict):
         raise OptionError(f"--options={args.options!r:.80}: a JSON object of the simulator's options")
-    platform = platform_named(args.platform).member_of(())  # of an env type of several, its first
+    platform = platform_named(args.platform).resolve(())  # of an env type of several, its first
     every = platform.tasks(args.options)
     tasks = tuple(choose_tasks(every, args.tasks) if args.tasks else every[:TASKS])
     request = CheckRequest(platform.name, tasks, args.options, args.steps, args.seed)

@@ -9,6 +9,6 @@ HELP = "try a policy for a few steps and look for the usual mistakes; takes lero
 
 def pass_through(argv: Sequence[str]) -> int:
     """Hands the whole command line to LeRobot's parser."""
-    from lerobot_roborecover.trials.check_policy import main
+    from lerobot_roborecover.evaluation.check_policy import main
 
     return main(argv)

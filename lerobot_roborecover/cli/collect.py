@@ -86,7 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
 def pass_through(argv: Sequence[str]) -> int:
     """Parses, collects, and prints the table."""
     from lerobot_roborecover.curation.collect.collection import collect, describe, plan
-    from lerobot_roborecover.words import counted
+    from lerobot_roborecover.utils.text import pluralize
 
     parser = build_parser()
     args, rest = parser.parse_known_args(pairs(argv))
@@ -105,7 +105,7 @@ def pass_through(argv: Sequence[str]) -> int:
         units = plan(chosen, lambda line: print(line, file=sys.stderr))
         for unit in units:
             print(f"{unit.id}  {unit.task.suite}/{unit.task.name}")
-        print(f"{counted(len(units), 'rollout')}; dry run: nothing was run")
+        print(f"{pluralize(len(units), 'rollout')}; dry run: nothing was run")
         return 0
     collected = collect(chosen, lambda line: print(line, file=sys.stderr))
     print(describe(collected))
@@ -126,10 +126,10 @@ def pairs(argv: Sequence[str]) -> list[str]:
 
 def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: list[str]) -> CollectOptions:
     """What to collect, from parsed arguments and those that are LeRobot's."""
-    from lerobot_roborecover.curation.collect.judge import Judging
+    from lerobot_roborecover.curation.collect.judge import FilterConfig
     from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
     from lerobot_roborecover.curation.collect.starts import parse_numbers
-    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.platforms import platform_named, platform_names
     from lerobot_roborecover.platforms.base import ENV_PREFIX
     from lerobot_roborecover.platforms.starts import Starts
@@ -156,7 +156,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
     seeds = parse_numbers(args.seeds, "--seeds") if args.seeds else ()
     states = parse_numbers(args.init_states, "--init-states") if args.init_states else ()
     return CollectOptions(
-        platform=platform_named(kind).member_of(env).name,
+        platform=platform_named(kind).resolve(env).name,
         out=args.out,
         starts=Starts(seeds, states, args.draw, args.seed, args.trials, args.reset_seed),
         tasks=tuple(args.task),
@@ -170,7 +170,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         device=args.device,
         perturb=args.perturb,
         perturbed_steps=args.perturb_steps,
-        judging=Judging(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
+        judging=FilterConfig(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
         seed=args.seed,
         frames=side,
         workplace=workplace(args),

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from lerobot_roborecover.datasets.licenses import license_argument
-from lerobot_roborecover.rounding import pin_policy_kernels
+from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
 HELP = (
     "Make the dataset that Correction is trained on: other policies' recoveries of training scenarios that "
@@ -70,16 +70,16 @@ def run(args: argparse.Namespace) -> int:
 
     from lerobot_roborecover.analysis.labels import tell_settings_apart
     from lerobot_roborecover.curation import donors
-    from lerobot_roborecover.curation.attrition import StageCounts
+    from lerobot_roborecover.curation.funnel import StageCounts
     from lerobot_roborecover.curation.normalisation import use_statistics_of
     from lerobot_roborecover.curation.policy_trials import env_config, read_trials, run_trials
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.datasets.schema import FOLDER
-    from lerobot_roborecover.env.identity import policy_identity
-    from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.env.trial_log import read_trial_log
-    from lerobot_roborecover.progress import Progress
-    from lerobot_roborecover.whole import check_new, write_whole
+    from lerobot_roborecover.errors import OptionError
+    from lerobot_roborecover.logs.trial_log import read_trial_log
+    from lerobot_roborecover.policies.identity import policy_identity
+    from lerobot_roborecover.utils.atomic_io import atomic_write, check_new
+    from lerobot_roborecover.utils.progress import Progress
 
     check_new(args.out)
     rows = [row for log in args.logs for row in read_trial_log(log)]
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         if args.statistics_of or Path(args.base).is_dir():
             use_statistics_of(folder, Path(args.statistics_of or args.base))
         note = donors.describe(options, base, funnel)
-        write_whole(folder / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
+        atomic_write(folder / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
 
     donors.write_donors(
         args.out, chosen, simulator=spec.slot.options, workers=args.workers, funnel=funnel,

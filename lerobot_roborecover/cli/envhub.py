@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Writes the files and says how to upload them."""
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.env.envhub_files import write_envhub
+    from lerobot_roborecover.evaluation.envhub_files import write_envhub
 
     found = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
     for path in write_envhub(found, args.out, args.repo_id, args.split):

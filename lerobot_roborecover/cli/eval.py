@@ -13,6 +13,6 @@ def pass_through(argv: Sequence[str]) -> int:
     # Before torch is loaded: threads of a policy on the CPU that spin while they wait for each other take the
     # cores from the simulators. It changes no number.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from lerobot_roborecover.trials.runner import main
+    from lerobot_roborecover.evaluation.runner import main
 
     return main(argv)

@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judges, computes, writes and prints."""
-    from lerobot_roborecover.interventions.monitor.errors import MonitorError
+    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 
     frames, side = ("monitor", "data"), ("detector", "scenarios", "policy")
     if args.scores:
@@ -116,17 +116,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _side_by_side(args: argparse.Namespace) -> int:
     """Detectors on a policy's trials."""
-    from lerobot_roborecover import __version__
+    from lerobot_roborecover._version import __version__
     from lerobot_roborecover.analysis.detection_page import (
         DETECTION_FILES,
         detection_text,
         write_detection_report,
     )
-    from lerobot_roborecover.curation.detection.request import DetectionRequest, compare_detectors
-    from lerobot_roborecover.curation.detection.strips import choose_trials, film_strips
-    from lerobot_roborecover.curation.detection.trials import TrialSource
-    from lerobot_roborecover.outputs import check_page
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.detection.request import DetectionRequest, compare_detectors
+    from lerobot_roborecover.detection.strips import choose_trials, film_strips
+    from lerobot_roborecover.detection.trials import TrialSource
+    from lerobot_roborecover.utils.outputs import check_page
+    from lerobot_roborecover.utils.progress import Progress
 
     check_page(args.out, DETECTION_FILES)
     source = TrialSource(
@@ -192,7 +192,7 @@ def _from_scores(args: argparse.Namespace) -> int:
         write_detection_report,
     )
     from lerobot_roborecover.analysis.stored_comparison import read_comparison
-    from lerobot_roborecover.outputs import check_page
+    from lerobot_roborecover.utils.outputs import check_page
 
     check_page(args.out, DETECTION_FILES)
     found = read_comparison(args.scores)
@@ -207,7 +207,7 @@ def _from_scores(args: argparse.Namespace) -> int:
 
 def _on_frames(args: argparse.Namespace) -> int:
     """One monitor on labelled frames."""
-    from lerobot_roborecover import __version__
+    from lerobot_roborecover._version import __version__
     from lerobot_roborecover.analysis.monitor_curves import choose_threshold
     from lerobot_roborecover.analysis.monitor_page import (
         MONITOR_FILES,
@@ -217,12 +217,12 @@ def _on_frames(args: argparse.Namespace) -> int:
     )
     from lerobot_roborecover.analysis.monitor_report import monitor_report
     from lerobot_roborecover.analysis.named_path import split_named
-    from lerobot_roborecover.curation.monitor_data.judging import judge_dataset
-    from lerobot_roborecover.interventions.monitor.errors import MonitorError
-    from lerobot_roborecover.interventions.monitor_interface import TrainedMonitor
-    from lerobot_roborecover.interventions.monitor_loading import load_monitor
-    from lerobot_roborecover.outputs import check_page
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.detection.data.judging import judge_dataset
+    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+    from lerobot_roborecover.policies.detectors.monitor_interface import TrainedMonitor
+    from lerobot_roborecover.policies.detectors.monitor_loading import load_monitor
+    from lerobot_roborecover.utils.outputs import check_page
+    from lerobot_roborecover.utils.progress import Progress
 
     check_page(args.out, MONITOR_FILES)
     if args.threshold is not None and args.choose_threshold:

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Writes the checkpoint."""
-    from lerobot_roborecover.interventions.export_ema import export_ema
+    from lerobot_roborecover.policies.export_ema import export_ema
 
     count = export_ema(args.checkpoint.resolve(), args.out)
     print(f"{args.out}: {count} averaged parameter tensors\nuse it with --policy.path={args.out}")

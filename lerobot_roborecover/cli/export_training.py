@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     )
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.datasets.trajectories import read_trajectories
-    from lerobot_roborecover.progress import Progress
-    from lerobot_roborecover.whole import check_new
+    from lerobot_roborecover.utils.atomic_io import check_new
+    from lerobot_roborecover.utils.progress import Progress
 
     check_new(args.out)
     scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)

@@ -68,11 +68,11 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.fork_gain import fork_gains
     from lerobot_roborecover.analysis.fork_page import PAGE, reproduced_text, write_gains
     from lerobot_roborecover.analysis.tables import to_text
-    from lerobot_roborecover.curation.forks.arms import parse_arm
-    from lerobot_roborecover.curation.forks.parents import Choice
-    from lerobot_roborecover.curation.forks.run import ForkRequest, run_forks
+    from lerobot_roborecover.detection.forks.arms import parse_arm
+    from lerobot_roborecover.detection.forks.parents import Choice
+    from lerobot_roborecover.detection.forks.run import ForkRequest, run_forks
     from lerobot_roborecover.errors import OptionError
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.utils.progress import Progress
 
     try:
         at = tuple(int(step) for step in args.at.split(",") if step.strip())

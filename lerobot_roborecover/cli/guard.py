@@ -8,7 +8,7 @@ from contextlib import suppress
 
 from lerobot_roborecover.cli.output import CLOSED_PIPE, accept_all_text, flush_output, output_is_closed
 from lerobot_roborecover.errors import RoboRecoverError, os_error_line
-from lerobot_roborecover.signals import status_of, stop_signals_raise
+from lerobot_roborecover.utils.signals import status_of, stop_signals_raise
 
 
 def guarded(name: str, work: Callable[[], int]) -> int:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.cli.guard import guarded
 
 COMMANDS = (

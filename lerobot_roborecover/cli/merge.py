@@ -21,13 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merges and says what came together."""
-    from lerobot_roborecover.trials.merge import merge
-    from lerobot_roborecover.words import counted
+    from lerobot_roborecover.logs.merge import merge
+    from lerobot_roborecover.utils.text import pluralize
 
     merged = merge(args.logs, args.out, unequal=args.unequal, force=args.force)
     scenarios = len({r.scenario_id for r in merged.rows})
     for remark in merged.remarks:
         print(f"note: {remark}", file=sys.stderr)
-    found = f"{counted(len(merged.rows), 'trial')} of {counted(scenarios, 'scenario')}"
-    print(f"{found} from {counted(len(args.logs), 'log')} in {args.out}")
+    found = f"{pluralize(len(merged.rows), 'trial')} of {pluralize(scenarios, 'scenario')}"
+    print(f"{found} from {pluralize(len(args.logs), 'log')} in {args.out}")
     return 0

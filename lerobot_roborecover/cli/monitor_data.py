@@ -67,9 +67,9 @@ def run(args: argparse.Namespace) -> int:
     """Makes the data and prints the counts."""
     import datasets
 
-    from lerobot_roborecover.curation.monitor_data.choice import TRAIN, DataOptions
-    from lerobot_roborecover.curation.monitor_data.request import MonitorRequest, make_monitor_data
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.detection.data.choice import TRAIN, DataOptions
+    from lerobot_roborecover.detection.data.request import MonitorRequest, make_monitor_data
+    from lerobot_roborecover.utils.progress import Progress
 
     datasets.disable_progress_bars()  # LeRobot's writer shows one per episode
     choice = DataOptions(

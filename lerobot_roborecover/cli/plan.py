@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.power import plans
     from lerobot_roborecover.analysis.style import png_of, svg_of
     from lerobot_roborecover.analysis.tables import to_csv, to_markdown, to_text
-    from lerobot_roborecover.outputs import check_page
-    from lerobot_roborecover.whole import write_whole
+    from lerobot_roborecover.utils.atomic_io import atomic_write
+    from lerobot_roborecover.utils.outputs import check_page
 
     _check(args)
     guess, remarks = _guess(args)
@@ -108,11 +108,11 @@ def run(args: argparse.Namespace) -> int:
         check_page(args.out, files, lambda page: b"](plan.svg)" in page.read_bytes())
         figure = detectable_figure(guess, trials, *common, at=at, differences=differences)
         text = f"![{figure.title}](plan.svg)\n\n" + "\n".join(to_markdown(table) for table in tables)
-        write_whole(args.out / "plan.md", text)
+        atomic_write(args.out / "plan.md", text)
         for table in tables:
-            write_whole(args.out / f"{table.name}.csv", to_csv(table))
-        write_whole(args.out / "plan.svg", svg_of(figure.plot))
-        write_whole(args.out / "plan.png", png_of(figure.plot))
+            atomic_write(args.out / f"{table.name}.csv", to_csv(table))
+        atomic_write(args.out / "plan.svg", svg_of(figure.plot))
+        atomic_write(args.out / "plan.png", png_of(figure.plot))
         print(f"plan      {args.out / 'plan.md'}\nfigure    {args.out / 'plan.svg'}")
     return 0
 
@@ -136,7 +136,7 @@ def _guess(args: argparse.Namespace):
     from lerobot_roborecover.analysis.estimators import RowsError
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.panel import make_panel
-    from lerobot_roborecover.analysis.power import Guess, guess_from
+    from lerobot_roborecover.analysis.power import PowerAssumptions, guess_from
     from lerobot_roborecover.analysis.units import ResamplingUnit
     from lerobot_roborecover.scenario import Start
 
@@ -145,7 +145,7 @@ def _guess(args: argparse.Namespace):
         if rate is None:
             raise RowsError("neither --pilot nor --rate: say what success rate to expect of the worse policy")
         sd = (rate * (1 - rate) / 3) ** 0.5 if args.sd is None and 0 < rate < 1 else (args.sd or 0) / 100
-        return Guess(rate, sd, 0.5 if args.correlation is None else args.correlation), []
+        return PowerAssumptions(rate, sd, 0.5 if args.correlation is None else args.correlation), []
     study = read_study(args.pilot)
     arms = study.of(Start.RECOVERY)
     if not 1 <= len(arms) <= 2:
@@ -157,7 +157,7 @@ def _guess(args: argparse.Namespace):
     panel = make_panel(arms)
     guess = guess_from(panel, rate, args.correlation)
     if args.sd is not None:
-        guess = Guess(guess.rate, args.sd / 100, guess.correlation)
+        guess = PowerAssumptions(guess.rate, args.sd / 100, guess.correlation)
     remarks = list(study.remarks)
     if panel.unit() is not ResamplingUnit.SCENARIO:
         remarks.append(

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Renders, and says what to do with the result."""
     from lerobot_roborecover.curation.render import describe, render
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.utils.progress import Progress
 
     asked = request(args)
     print(describe(asked, render(asked, Progress("part"))))

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs both arms and writes the report; exit status 1 where the initial arm is below what is
     published."""
-    from lerobot_roborecover.analysis.agreement import Standing
+    from lerobot_roborecover.analysis.agreement import AgreementVerdict
     from lerobot_roborecover.reproduce import (
         ReproductionPlan,
         find_checkpoint,
@@ -79,4 +79,4 @@ def run(args: argparse.Namespace) -> int:
     result = run_arms(plan, say=lambda line: print(line, flush=True))
     page, _ = write_record(result)
     print(f"\n{verdict(result)}\nreport {page}", file=sys.stdout)
-    return 1 if result.check.standing is Standing.LOWER else 0
+    return 1 if result.check.standing is AgreementVerdict.LOWER else 0

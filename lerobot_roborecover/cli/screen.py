@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
-from lerobot_roborecover.rounding import pin_policy_kernels
+from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.screen.dataset import ScreenRequest
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     """Screens, and prints the tables and the funnel."""
     pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     from lerobot_roborecover.curation.screen.dataset import describe, screen_dataset
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.utils.progress import Progress
 
     asked = request(args)
     print(describe(asked, screen_dataset(asked, Progress("trial").of)))

@@ -9,6 +9,6 @@ HELP = "serve a LeRobot policy over openpi's websocket protocol; takes --policy.
 
 def pass_through(argv: Sequence[str]) -> int:
     """Hands the whole command line to LeRobot's parser."""
-    from lerobot_roborecover.remote.serve import main
+    from lerobot_roborecover.policies.remote.serve import main
 
     return main(argv)

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluates, compares, reports; exit status 1 where outcomes differ from the stored ones."""
-    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.study.arms import arms, report_command
     from lerobot_roborecover.study.definition import read_definition, shipped_study
     from lerobot_roborecover.study.evaluate import (

@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serves the page until interrupted, then writes the dataset."""
-    from lerobot_roborecover.env.options import OptionError
-    from lerobot_roborecover.studio.teleop.serve import TeleopConfig, serve, write
-    from lerobot_roborecover.studio.teleop.starts import continued, first_states
+    from lerobot_roborecover.errors import OptionError
+    from lerobot_roborecover.web.teleop.serve import TeleopConfig, serve, write
+    from lerobot_roborecover.web.teleop.starts import continued, first_states
 
     def say(line: str) -> None:
         print(line, flush=True)

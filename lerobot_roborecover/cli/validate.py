@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Validates, and prints the distribution and the funnel."""
     from lerobot_roborecover.curation.validate.dataset import describe, validate_dataset
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.utils.progress import Progress
 
     if args.states:
         return _states(args)
@@ -73,7 +73,7 @@ def request(args: argparse.Namespace) -> ValidationRequest:
     """What to validate, from parsed arguments."""
     from lerobot_roborecover.curation.validate.request import ValidationRequest, read_rejects
     from lerobot_roborecover.curation.validate.validation import ValidationRule
-    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.errors import OptionError
 
     if args.trials_folder is None:
         raise OptionError("--trials-folder is missing: name the folder where roborecover screen kept trials")
@@ -98,7 +98,7 @@ def request(args: argparse.Namespace) -> ValidationRequest:
 
 def _states(args: argparse.Namespace) -> int:
     from lerobot_roborecover.curation.validate.states import write_states
-    from lerobot_roborecover.progress import Progress
+    from lerobot_roborecover.utils.progress import Progress
 
     found = write_states(args.dataset, args.out, args.workers, Progress("replay"), workplace(args))
     print(

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.workers.workplace import Workplace
+    from lerobot_roborecover.workers.backend import Backend
 
 
 def add_workplace(parser: argparse.ArgumentParser, *, policies: bool) -> None:
@@ -26,8 +26,8 @@ def add_workplace(parser: argparse.ArgumentParser, *, policies: bool) -> None:
         )  # fmt: skip
 
 
-def workplace(args: argparse.Namespace) -> Workplace:
+def workplace(args: argparse.Namespace) -> Backend:
     """What they say."""
-    from lerobot_roborecover.workers.workplace import Workplace
+    from lerobot_roborecover.workers.backend import Backend
 
-    return Workplace(args.engine, args.ray_address)
+    return Backend(args.engine, args.ray_address)

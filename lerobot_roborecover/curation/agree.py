@@ -8,8 +8,8 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.agreement import format_agreement
 from lerobot_roborecover.curation.annotation.votes import votes_folder
-from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.funnel import attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.resolution import (
     NOT_PEOPLES,
     Resolution,
@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.resolution import (
     write_discussion,
     write_resolution,
 )
-from lerobot_roborecover.words import counted, next_line
+from lerobot_roborecover.utils.text import next_command, pluralize
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,20 @@ def agree(request: AgreeRequest, say: Callable[[str], None]) -> Resolution:
     candidates = read_candidates(request.dataset)
     found = resolve(candidates, votes_folder(request.dataset, request.votes), request.config)
     counts = found.counts()
-    say(f"{counted(len(found.annotators), 'annotator')}: {', '.join(found.annotators)}; round {found.rounds}")
+    say(
+        f"{pluralize(len(found.annotators), 'annotator')}: {', '.join(found.annotators)}; "
+        f"round {found.rounds}"
+    )
     if NOT_PEOPLES[found.kind]:
         say(NOT_PEOPLES[found.kind])
     say(format_agreement(found.agreement))
     say(", ".join(f"{n} {outcome}" for outcome, n in sorted(counts.items())))
     if request.discuss:
         listed = write_discussion(request.discuss, found)
-        say(f"{counted(listed, 'candidate')} to discuss" + (f" in {request.discuss}" if listed else ""))
+        say(f"{pluralize(listed, 'candidate')} to discuss" + (f" in {request.discuss}" if listed else ""))
     if request.out:
         write_resolution(request.out, candidates, found, request.config, license=request.license)
-        say(f"{counted(counts['kept'], 'scenario')} in {request.out}")
+        say(f"{pluralize(counts['kept'], 'scenario')} in {request.out}")
         say(attrition_table(count_stages(read_decisions(request.out))))
-        say(next_line(["screen", str(request.out), "--policy", "CHECKPOINT", "--out", "SCREENED"]))
+        say(next_command(["screen", str(request.out), "--policy", "CHECKPOINT", "--out", "SCREENED"]))
     return found

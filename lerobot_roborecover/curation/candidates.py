@@ -35,7 +35,7 @@ from lerobot_roborecover.datasets.trajectories import (
     actions_sha256,
     read_trajectories,
 )
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 from lerobot_roborecover.scenario import (
     ID_RULE,
     DeviationType,

@@ -12,9 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.curation.annotation.carried import copy_examples, gather_votes, write_votes
-from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
 from lerobot_roborecover.curation.candidates import (
     CANDIDATES_FILE,
     MAX_CANDIDATES_BYTES,
@@ -26,12 +25,13 @@ from lerobot_roborecover.curation.candidates import (
     check_candidates,
     read_candidates,
 )
+from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_metadata, write_trajectories
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import new_file, new_folder, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_file, atomic_write
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def write_candidates(
             yield recording.trajectory
             kept.append(recording)
 
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         write_trajectories(folder, "rollouts", draw(), fps=fps, description=description, license=license)
         candidates = [r.candidate for r in kept]
         check_candidates(str(root), candidates, read_trajectories(folder).rows)
@@ -114,7 +114,7 @@ def merge_candidates(root: str | os.PathLike[str], sources: Sequence[Path]) -> P
     rows = [r for s in sets for r in s.trajectories.rows]
     folders = [s.root for s in sets]
     votes = gather_votes(folders, root, {c.id for c in candidates})
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         join_datasets(folder, folders, [row.steps for row in rows])
         check_candidates(str(root), candidates, rows)
         write_metadata(
@@ -170,7 +170,7 @@ def write_candidate_metadata(
         raise ScenarioError(f"{CANDIDATES_FILE} would exceed {MAX_CANDIDATES_BYTES} bytes; split the dataset")
     # One row group an episode: a page reads one without decoding a thousand.
     with (
-        new_file(folder / STEPS_FILE) as path,
+        atomic_file(folder / STEPS_FILE) as path,
         pq.ParquetWriter(path, STEPS_SCHEMA, compression="zstd") as writer,
     ):
         for episode, step in enumerate(steps):
@@ -183,7 +183,7 @@ def write_candidate_metadata(
             }
             columns = [pa.array([row[f.name]], f.type) for f in STEPS_SCHEMA]
             writer.write_table(pa.Table.from_arrays(columns, schema=STEPS_SCHEMA))
-    write_whole(folder / CANDIDATES_FILE, text)
+    atomic_write(folder / CANDIDATES_FILE, text)
 
 
 def _check_steps(recording: Recording) -> None:

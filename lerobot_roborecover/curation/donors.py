@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.attrition import StageCounts
-from lerobot_roborecover.curation.monitor_data.frames import RenderedSteps, RenderJob, replayed
+from lerobot_roborecover.curation.funnel import StageCounts
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, check_repeats
+from lerobot_roborecover.datasets.rendered_steps import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def judge(
         complete = [t for t in four if Outcome(t.row.outcome).valid]
         donor = Donor(candidate, tuple(four))
         if len(four) < wanted:
-            dropped[f"with fewer than {counted(wanted, 'trial')}"] += 1
+            dropped[f"with fewer than {pluralize(wanted, 'trial')}"] += 1
         elif len(complete) < wanted:
             dropped["with a trial that did not complete"] += 1
         elif len(donor.successes) < min(options.successes, wanted):

@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 _STATS = Path("meta") / "stats.json"
 _PREPROCESSOR = "policy_preprocessor.json"
@@ -58,5 +58,5 @@ def use_statistics_of(root: Path, folder: Path) -> list[str]:
         raise ScenarioError(
             f"{folder} has no statistics of the action; it cannot be trained further on {root}"
         )
-    write_whole(path, json.dumps(stats, indent=4) + "\n")
+    atomic_write(path, json.dumps(stats, indent=4) + "\n")
     return sorted(replaced)

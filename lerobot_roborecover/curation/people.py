@@ -19,16 +19,16 @@ from typing import Any
 from lerobot_roborecover.curation.annotation.annotators import is_automatic
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
 from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER
-from lerobot_roborecover.curation.attrition import DECISIONS_FILE, SCHEMA_VERSION, read_decisions
 from lerobot_roborecover.curation.candidates import CANDIDATES_FILE, read_candidates
+from lerobot_roborecover.curation.funnel import DECISIONS_FILE, SCHEMA_VERSION, read_decisions
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.contents import list_files
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, SCENARIOS_FILE
-from lerobot_roborecover.journal import read_journal
 from lerobot_roborecover.scenario import Scenario, ScenarioError, Source
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.journal import read_journal
 
 PSEUDONYM = "annotator-{}"
 INSPECTION = "rejected on inspection"
@@ -136,7 +136,7 @@ def anonymise(root: Path, target: Path, people: People) -> list[str]:
     rewritten = set()
 
     def put(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
-        write_whole(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in records))
+        atomic_write(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in records))
 
     for path in _vote_files(root):
         rewritten.add(path.relative_to(root).as_posix())

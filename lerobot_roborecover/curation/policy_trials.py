@@ -15,22 +15,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_roborecover.env.facts import facts_of
-from lerobot_roborecover.env.policy_settings import digest_of
-from lerobot_roborecover.env.run import open_run
-from lerobot_roborecover.env.trial import Trial
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, keep_actions, read_actions
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow, trial_key
+from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.session import create_session
+from lerobot_roborecover.evaluation.trial import Trial
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions, read_actions
+from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.row import TrialRow, trial_key
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.places import EnginePlaces, open_engine
-from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.env.configs import RecoveryEnvConfig
+    from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 
 TRIALS_FILE = "trials.jsonl"
 CURRENT_FILE = "current.json"
@@ -57,7 +57,7 @@ def run_trials(
     device: str | None = None,
     slots: int = 0,
     max_batch: int = 1,
-    workplace: Workplace = HERE,
+    workplace: Backend = LOCAL,
     replicas: int = 0,
     policy_options: Sequence[str] = (),
     rename_map: Mapping[str, str] | None = None,
@@ -77,7 +77,7 @@ def run_trials(
         max_batch: observations per inference, at most. Above 1 the last bits of an action depend on the
             other observations of its inference, and so may the outcome.
         workplace: where simulators and policy are.
-        replicas: copies of the policy on a cluster, see `EnginePlaces`.
+        replicas: copies of the policy on a cluster, see `EngineConfig`.
         policy_options: `--name=value` options of the policy's config.
         rename_map: the env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
         on_row: told of each finished trial, and how many are done of how many.
@@ -89,25 +89,25 @@ def run_trials(
         OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
         ScenarioError: the policy went away or hung, so that trials were not run.
     """
-    from lerobot_roborecover.trials import load
+    from lerobot_roborecover.evaluation import loading
 
-    config = load.policy_config(policy, policy_options, device)
-    facts = facts_of(config, rename_map=rename_map, n_episodes=trials)
+    config = loading.policy_config(policy, policy_options, device)
+    facts = policy_metadata(config, rename_map=rename_map, n_episodes=trials)
     env.trial_log = str(folder / TRIALS_FILE)
-    scenarios, run = open_run(env, env.run_spec(), workers=True, facts=facts)
-    log = run.kept_log()
+    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts)
+    log = run.require_log()
     run.protocol = replace(run.protocol, run_seed=seed)
     chosen = [s for s in scenarios if only is None or s.id in only]
     units = units_of(sorted(chosen, key=lambda s: s.id), trials)
     hash_ = run.protocol.config_hash()
     keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
-    write_whole(folder / CURRENT_FILE, json.dumps({"config_hash": hash_}) + "\n")
+    atomic_write(folder / CURRENT_FILE, json.dumps({"config_hash": hash_}) + "\n")
     run.pool.acquire()
     try:
         todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
         if todo:
-            spec = load.HostSpec(config, env, rename_map or {}, seed, max_batch)
-            places = EnginePlaces(
+            spec = loading.HostSpec(config, env, rename_map or {}, seed, max_batch)
+            places = EngineConfig(
                 workplace, slots, replicas, str(config.device), env.obs_type != "state",
                 snapshot_dir=env.snapshot_dir or None,
             )  # fmt: skip
@@ -118,7 +118,7 @@ def run_trials(
                 count[0] += 1
                 on_row(row, count[0], len(units))
 
-            engine = open_engine(run, todo, partial(load.load_host, spec), places, on_row=told)
+            engine = open_engine(run, todo, partial(loading.load_host, spec), places, on_row=told)
             engine.run(todo)
             engine.check_all_run()
         rows = {r.key(): r for r in log.rows}
@@ -176,7 +176,7 @@ def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> Re
     """
     import draccus
 
-    from lerobot_roborecover.env.configs import env_type
+    from lerobot_roborecover.evaluation.env_configs import env_type
 
     which = [f"--{name}={value}" for name, value in flat_options(platform_named(platform).env_defaults)]
     return draccus.parse(env_type(platform), args=[*which, f"--scenarios={scenarios}", *options])
@@ -208,7 +208,7 @@ def _keep_actions(folder: Path, trial: Trial, row: TrialRow) -> None:
             f"{row.steps} steps: it went back in time, and cannot be replayed as one run. Run its base "
             "policy"
         )
-    keep_actions(folder, trial, row)
+    put_actions(folder, trial.actions, row)
 
 
 def _with_actions(row: TrialRow, folder: Path) -> PolicyTrial:

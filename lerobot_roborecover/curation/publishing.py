@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.curation.people import anonymise, find_people
-from lerobot_roborecover.temporary import TemporaryFolder
+from lerobot_roborecover.utils.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     import numpy as np

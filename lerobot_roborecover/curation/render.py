@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import DECISIONS_FILE, carry_decisions
+from lerobot_roborecover.curation.funnel import DECISIONS_FILE, carry_decisions
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.render import check_rendering, forget_shards, render_dataset
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import check_new, new_folder
-from lerobot_roborecover.words import counted, next_line
+from lerobot_roborecover.utils.atomic_io import atomic_dir, check_new
+from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.jobs import JobPool
 
 SIZE = 256
@@ -69,7 +69,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
     work = request.work or request.out.with_name(f"{request.out.name}.parts")
     with (
         JobPool(manifest["platform"], options, request.workers) as pool,
-        new_folder(request.out) as folder,
+        atomic_dir(request.out) as folder,
     ):
         check_rendering(scenarios, pool)
         render_dataset(
@@ -96,8 +96,8 @@ def describe(request: RenderRequest, episodes: int) -> str:
         request: what was asked for.
         episodes: number of them.
     """
-    done = f"{counted(episodes, 'episode')} in {request.out}"
-    return f"{done}\n{next_line(publish_next(request.out))}"
+    done = f"{pluralize(episodes, 'episode')} in {request.out}"
+    return f"{done}\n{next_command(publish_next(request.out))}"
 
 
 def publish_next(root: Path) -> list[str]:

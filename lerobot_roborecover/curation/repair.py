@@ -15,12 +15,6 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.annotation.carried import copy_examples, gather_votes, write_votes
 from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER
-from lerobot_roborecover.curation.attrition import (
-    DECISIONS_FILE,
-    Decision,
-    read_decisions,
-    record_decisions,
-)
 from lerobot_roborecover.curation.candidates import (
     CANDIDATES_FILE,
     Candidate,
@@ -29,13 +23,19 @@ from lerobot_roborecover.curation.candidates import (
     read_candidates,
 )
 from lerobot_roborecover.curation.candidates_write import check_joinable, write_candidate_metadata
+from lerobot_roborecover.curation.funnel import (
+    DECISIONS_FILE,
+    Decision,
+    read_decisions,
+    record_decisions,
+)
 from lerobot_roborecover.datasets.load import load_scenarios
 from lerobot_roborecover.datasets.repair import Repaired, read_edited, repair
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
 from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 
 def repair_dataset(
@@ -94,11 +94,11 @@ def _repair_candidates(root: Path, sets: Sequence[CandidateSet], dry_run: bool) 
     votes = gather_votes(folders, root, there)
     lines = [
         _decisions_line(decisions, gone),
-        f"{VOTES_FOLDER}: {counted(sum(map(len, votes.values())), 'record')} of "
-        f"{counted(len(votes), 'annotator')}; votes that are "
+        f"{VOTES_FOLDER}: {pluralize(sum(map(len, votes.values())), 'record')} of "
+        f"{pluralize(len(votes), 'annotator')}; votes that are "
         "kept elsewhere (--votes FOLDER) go by candidate id and need no repair",
     ]
-    lines = [f"{CANDIDATES_FILE} and steps.parquet: {counted(len(candidates), 'candidate')}", *lines]
+    lines = [f"{CANDIDATES_FILE} and steps.parquet: {pluralize(len(candidates), 'candidate')}", *lines]
     names = [str(f) for f in folders]
     if dry_run:
         done = repair(root, names, dry_run=True)
@@ -164,8 +164,8 @@ def _decisions(root: Path, sources: Iterable[Sequence[Decision]], gone: set[str]
 def _decisions_line(decisions: Sequence[Decision], gone: set[str]) -> str:
     on = len({d.candidate for d in decisions})
     return (
-        f"{DECISIONS_FILE}: {counted(len(decisions), 'decision')} on {counted(on, 'rollout')}; "
-        f"{counted(len(gone), 'candidate')} of the sources not "
+        f"{DECISIONS_FILE}: {pluralize(len(decisions), 'decision')} on {pluralize(on, 'rollout')}; "
+        f"{pluralize(len(gone), 'candidate')} of the sources not "
         "in this dataset"
     )
 

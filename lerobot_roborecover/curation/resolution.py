@@ -25,14 +25,14 @@ from lerobot_roborecover.curation.agreement import Agreement, agreement
 from lerobot_roborecover.curation.annotation.annotators import label_kind
 from lerobot_roborecover.curation.annotation.discussion import MAX_ROUNDS, Discussion, read_discussion
 from lerobot_roborecover.curation.annotation.votes import Vote, ballot, read_votes
-from lerobot_roborecover.curation.attrition import (
+from lerobot_roborecover.curation.candidates import CandidateSet
+from lerobot_roborecover.curation.funnel import (
     Decision,
     carry_decisions,
     read_decisions,
     record_decisions,
-    standing,
+    survivors,
 )
-from lerobot_roborecover.curation.candidates import CandidateSet
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.scenario import DeviationType, Scenario, ScenarioError, Stage
 
@@ -198,7 +198,7 @@ def _moment(candidates: CandidateSet, r: Resolved) -> str:
 def queued(candidates: CandidateSet) -> set[str]:
     """Candidates that annotators see: all but those that a stage before has dropped."""
     decisions = read_decisions(candidates.root)
-    dropped = {d.candidate for d in decisions} - standing(decisions, "collect")
+    dropped = {d.candidate for d in decisions} - survivors(decisions, "collect")
     return {c.id for c in candidates.candidates} - dropped
 
 

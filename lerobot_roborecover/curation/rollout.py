@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, Recorder
+from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, Recorder
 from lerobot_roborecover.scenario import Reset, Task
 
 PERTURBED_STEPS = 150

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover import __version__
-from lerobot_roborecover.curation.attrition import (
+from lerobot_roborecover._version import __version__
+from lerobot_roborecover.curation.funnel import (
     Decision,
     attrition_table,
     carry_decisions,
@@ -27,8 +27,8 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import new_folder, write_whole
-from lerobot_roborecover.words import counted, next_line
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
+from lerobot_roborecover.utils.text import next_command, pluralize
 
 SPLIT_FILE = "split.json"
 SCHEMA_VERSION = 1
@@ -73,7 +73,7 @@ def split_dataset(
         with update_folder(root) as update:
             return _divide(root, config, update, force=force)
     _divide(root, config)  # refuses before anything is copied
-    with new_folder(out) as folder:
+    with atomic_dir(out) as folder:
         _copy(root, folder)
         with update_folder(folder) as update:
             return _divide(folder, config, update, force=True)
@@ -160,7 +160,7 @@ def format_report(report: SplitReport) -> str:
     """The report as text."""
     names = list(report.counts)
     lines = [
-        f"{counted(sum(report.counts.values()), 'scenario')} in {counted(report.groups, 'group')}, "
+        f"{pluralize(sum(report.counts.values()), 'scenario')} in {pluralize(report.groups, 'group')}, "
         f"the largest of {report.largest_group}; kept apart: {', '.join(report.apart)}",
         f"{'':<34}" + "".join(f"{name:>10}" for name in names),
         f"{'scenarios':<34}" + "".join(f"{report.counts[name]:>10}" for name in names),
@@ -186,7 +186,9 @@ def describe(report: SplitReport, root: Path) -> str:
     """
     rows = count_stages(read_decisions(root))
     funnel = [attrition_table(rows)] if rows else []
-    return "\n".join((format_report(report), *funnel, next_line(["render", str(root), "--out", "RENDERED"])))
+    return "\n".join(
+        (format_report(report), *funnel, next_command(["render", str(root), "--out", "RENDERED"]))
+    )
 
 
 def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[str]) -> None:
@@ -200,7 +202,7 @@ def _record(root: Path, config: SplitConfig, report: SplitReport, ids: Sequence[
         "counts": dict(report.counts),
         "groups": report.groups,
     }
-    write_whole(root / FOLDER / SPLIT_FILE, json.dumps(document, indent=2) + "\n")
+    atomic_write(root / FOLDER / SPLIT_FILE, json.dumps(document, indent=2) + "\n")
     # A set that was not built here has no history to go on with.
     if read_decisions(root):
         record_decisions(root, (Decision(i, "split", "kept", by=f"seed {config.seed}") for i in ids))

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover import __version__
-from lerobot_roborecover.curation.attrition import (
+from lerobot_roborecover._version import __version__
+from lerobot_roborecover.curation.funnel import (
     Decision,
     attrition_table,
     carry_decisions,
@@ -20,7 +20,7 @@ from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 
 
 def write_stage(
@@ -57,7 +57,7 @@ def write_stage(
         "schema_version": 1, "written_by": {"lerobot_env_roborecover": __version__}, **content,
     }  # fmt: skip
     frames = FrameStore(source) if source else None
-    with new_folder(out) as folder:
+    with atomic_dir(out) as folder:
         write_scenarios(
             folder,
             scenarios,

@@ -31,7 +31,7 @@ _LOOK_S = 1.0
 """How often a waiting frame looks whether the encoder still lives."""
 
 
-class PatientEncoder(StreamingVideoEncoder):
+class BlockingEncoder(StreamingVideoEncoder):
     """The streaming encoder, with frames that wait for room instead of being thrown away."""
 
     def feed_frame(self, video_key: str, image: np.ndarray) -> None:
@@ -205,7 +205,7 @@ class EpisodeWriter:
         writer = dataset.writer
         theirs = None if writer is None else writer._streaming_encoder
         if writer is not None and theirs is not None:
-            writer._streaming_encoder = PatientEncoder(
+            writer._streaming_encoder = BlockingEncoder(
                 theirs.fps,
                 theirs._rgb_encoder,
                 theirs._depth_encoder,

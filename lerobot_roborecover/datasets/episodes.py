@@ -21,7 +21,7 @@ from lerobot_roborecover.datasets.frames import LastFrames, Tail
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.simulator import Observation, Simulator
-from lerobot_roborecover.platforms.walk import walk
+from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 EXACT_ACTION = "roborecover.action"
@@ -45,7 +45,7 @@ def render_prefix(
     """
     tail = Tail(scenario.platform)
     steps = len(scenario.prefix)
-    for step in walk(simulator, scenario.rollout):
+    for step in iter_steps(simulator, scenario.rollout):
         if step == steps and last is None:
             return
         observation = simulator.observe()

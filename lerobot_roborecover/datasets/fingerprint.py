@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.journal import AppendOnly, InUseError
 from lerobot_roborecover.platforms import SimulatorError, platform_named
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.versions import installed
-from lerobot_roborecover.replay import record_handoff
+from lerobot_roborecover.replay.handoff import record_handoff
 from lerobot_roborecover.scenario import Fingerprint, Pose, Scenario, ScenarioError
+from lerobot_roborecover.utils.journal import AppendOnly, InUseError
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
-from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 type ResetCheck = Callable[[Simulator, Scenario], dict[str, float]]
 """Measures how far the simulator, just reset, is from what a scenario's record says; raises `ScenarioError`
@@ -50,7 +50,7 @@ def fingerprint_scenarios(
     check: ResetCheck | None = None,
     workers: int = 1,
     pool: JobPool | None = None,
-    workplace: Workplace = HERE,
+    workplace: Backend = LOCAL,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Replayed]:
     """Replays every scenario once.
@@ -160,7 +160,7 @@ def _jobs(scenarios: Sequence[Scenario], rows: Sequence[int]) -> list[list[int]]
 def _salt(platform: str, options: Mapping[str, Any]) -> str:
     found = platform_named(platform)
     versions = {name: installed(name) for name in found.required_versions}
-    return json.dumps([versions, found.salt(options)])
+    return json.dumps([versions, found.environment_fingerprint(options)])
 
 
 def _open_log(log: Path) -> tuple[AppendOnly, dict[str, dict[str, Any]]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.walk import walk
+from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def last_frames(simulator: Simulator, scenario: Scenario) -> LastFrames:
         scenario: what to replay; the simulator is left at its recovery point.
     """
     tail = Tail(scenario.platform)
-    for step in walk(simulator, scenario.rollout):
+    for step in iter_steps(simulator, scenario.rollout):
         if step > len(scenario.prefix) - KEPT:
             tail.add(simulator.observe())
     return tail.frames(scenario)

@@ -14,13 +14,13 @@ from lerobot_roborecover.datasets.load import ScenarioSet
 from lerobot_roborecover.datasets.schema import package_versions
 from lerobot_roborecover.platforms.robot_fingerprint import NAME, is_robot_entry
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.platforms.walk import walk
+from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.scenario import DeviationType, Pose, Scenario, ScenarioError, Stage
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 
 @dataclass(frozen=True)
-class Moment:
+class ReplayState:
     """One state of a replay."""
 
     step: int
@@ -32,11 +32,11 @@ class Moment:
     """The action that follows; None at the recovery point."""
 
 
-def replay_moments(simulator: Simulator, scenario: Scenario) -> Iterator[Moment]:
+def replay_moments(simulator: Simulator, scenario: Scenario) -> Iterator[ReplayState]:
     """Every state of a scenario's prefix, from the reset to the recovery point."""
-    for step in walk(simulator, scenario.rollout):
+    for step in iter_steps(simulator, scenario.rollout):
         following = scenario.prefix[step] if step < len(scenario.prefix) else None
-        yield Moment(step, simulator.render(), simulator.bodies(), following)
+        yield ReplayState(step, simulator.render(), simulator.bodies(), following)
 
 
 def summary(found: ScenarioSet) -> str:
@@ -46,8 +46,8 @@ def summary(found: ScenarioSet) -> str:
     lengths = np.array([len(s.prefix) for s in scenarios])
     lines = [
         f"{found.source}" + (f" at {found.revision}" if found.revision else ""),
-        f"platform {found.platform}, {counted(len(scenarios), 'scenario')}, "
-        f"{counted(len({(s.task.suite, s.task.name) for s in scenarios}), 'task')}, licence "
+        f"platform {found.platform}, {pluralize(len(scenarios), 'scenario')}, "
+        f"{pluralize(len({(s.task.suite, s.task.name) for s in scenarios}), 'task')}, licence "
         f"{found.manifest.get('license') or 'not given'}",
         f"prefixes {lengths.min()} to {lengths.max()} actions, median {np.median(lengths):g}, mean "
         f"{lengths.mean():.1f}",
@@ -94,7 +94,7 @@ def describe(scenario: Scenario) -> str:
         f"source       {scenario.source.value}"
         + (f" ({scenario.source_policy})" if scenario.source_policy else ""),
         f"split        {scenario.split}" + (f", cluster {scenario.cluster}" if scenario.cluster else ""),
-        f"prefix       {counted(len(scenario.prefix), 'action')} of {scenario.prefix.shape[1]}, settling "
+        f"prefix       {pluralize(len(scenario.prefix), 'action')} of {scenario.prefix.shape[1]}, settling "
         f"{reset.settle_steps}; then up to {task.horizon} steps",
         f"reset        seed {reset.seed}, init state {reset.init_state_index}, "
         f"{len(reset.fixtures)} fixtures",
@@ -203,7 +203,7 @@ class _Recording:
         self._stream.save(str(path))
         self._stream.log("scenario", rerun.TextDocument(describe(scenario)), static=True)
 
-    def add(self, moment: Moment) -> None:
+    def add(self, moment: ReplayState) -> None:
         """Logs one state under its step."""
         rerun, stream = self._rerun, self._stream
         stream.set_time("step", sequence=moment.step)

@@ -106,7 +106,7 @@ def check_lerobot_folder(root: Path) -> LeRobotFolder:
         if isinstance(err, ScenarioError):
             raise
         raise ScenarioError(f"{path} is not LeRobot's ({err!r:.200}): {what_it_is(data)}. {_FETCH}") from None
-    tasks, in_order = _read_tasks(root)
+    tasks, map_ordered = _read_tasks(root)
     lengths, files = _read_episodes(root, episodes, [k for k, f in features.items() if f["dtype"] == "video"])
     for name in sorted(files):
         if not (root / name).is_file():
@@ -114,7 +114,7 @@ def check_lerobot_folder(root: Path) -> LeRobotFolder:
     _check_data(root, features, lengths, len(tasks))
     if sum(lengths) != frames:
         raise ScenarioError(f"{path}: total_frames is {frames}, meta/episodes has {sum(lengths)}. {_FETCH}")
-    return LeRobotFolder(root, features, tasks, in_order, tuple(lengths))
+    return LeRobotFolder(root, features, tasks, map_ordered, tuple(lengths))
 
 
 def _check_version(root: Path, version: str) -> None:

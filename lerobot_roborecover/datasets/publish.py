@@ -26,9 +26,9 @@ from lerobot_roborecover.datasets.benchmark import EVAL_FILE, VIEWER_FOLDER
 from lerobot_roborecover.datasets.card import MARK, CardFiles, make_card
 from lerobot_roborecover.datasets.contents import check_file, list_files
 from lerobot_roborecover.datasets.pull import validate
-from lerobot_roborecover.datasets.retries import ATTEMPTS, HubUnreachable, again
+from lerobot_roborecover.datasets.retries import ATTEMPTS, HubUnreachable, retry
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 LEROBOT_TAG = "v3.0"
 """LeRobot loads a dataset at the tag of its own format version."""
@@ -95,7 +95,7 @@ class PublishPlan:
                 f"dataset   {self.config.called or self.root}",
                 f"to        {self.config.repo_id}; if it does not exist, {where} is made",
                 f"unknown   what is there already: {self.unreachable}",
-                f"upload    at most {counted(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB",
+                f"upload    at most {pluralize(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB",
                 *(f"  + {name}" for name in self.add),
                 "delete    files that are there and not in the dataset",
                 f"tags      {tags}; refused where the version is published already and differs",
@@ -104,10 +104,10 @@ class PublishPlan:
         return [
             f"dataset   {self.config.called or self.root}",
             f"to        {self.config.repo_id}, {where}" + (f" at {self.head}" if self.head else ""),
-            f"upload    {counted(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB; "
+            f"upload    {pluralize(len(self.add), 'file')}, {self.bytes / 1e6:.1f} MB; "
             f"{self.same} are there already",
             *(f"  + {name}" for name in self.add),
-            f"delete    {counted(len(self.delete), 'file')}",
+            f"delete    {pluralize(len(self.delete), 'file')}",
             *(f"  - {name}" for name in self.delete),
             f"tags      {tags}",
             f"licence   {self.card.license}",
@@ -161,11 +161,11 @@ def plan_publish(
     attempts = 1 if to_show else ATTEMPTS
     try:
         missing = (RepositoryNotFoundError,)
-        refs = again(lambda: _refs(api, config.repo_id), f"{where}: looking it up", missing, attempts)
+        refs = retry(lambda: _refs(api, config.repo_id), f"{where}: looking it up", missing, attempts)
         main = refs["branches"].get("main")
         if main:
             head = main
-            remote = again(
+            remote = retry(
                 lambda: _remote_files(api, config.repo_id, main), f"{where}: listing", attempts=attempts
             )
     except RepositoryNotFoundError:
@@ -229,7 +229,7 @@ def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda don
         raise ScenarioError(plan.unreachable)
     api, config = HfApi(), plan.config
     where = f"Hub dataset {config.repo_id}"
-    again(
+    retry(
         lambda: api.create_repo(config.repo_id, repo_type="dataset", private=config.private, exist_ok=True),
         f"{where}: creating it",
     )
@@ -239,7 +239,7 @@ def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda don
         for begin in range(0, len(adds), _FILES_PER_UPLOAD):
             part = adds[begin : begin + _FILES_PER_UPLOAD]
             # Files that a failed attempt has sent are marked as uploaded, so that another one goes on.
-            again(
+            retry(
                 lambda part=part: api.preupload_lfs_files(
                     config.repo_id, part, repo_type="dataset", free_memory=False
                 ),
@@ -247,7 +247,7 @@ def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda don
             )
             progress(begin + len(part), len(adds))
         operations = [*adds, *(CommitOperationDelete(name) for name in plan.delete)]
-        commit = again(
+        commit = retry(
             lambda: (
                 api.create_commit(
                     config.repo_id,
@@ -260,7 +260,7 @@ def publish(plan: PublishPlan, progress: Callable[[int, int], None] = lambda don
             f"{where}: committing",
         )
     for tag in plan.tags:
-        again(lambda tag=tag: _set_tag(api, config.repo_id, tag, commit), f"{where}: setting tag {tag}")
+        retry(lambda tag=tag: _set_tag(api, config.repo_id, tag, commit), f"{where}: setting tag {tag}")
     return Published(commit, tuple(plan.tags), f"{api.endpoint}/datasets/{config.repo_id}")
 
 

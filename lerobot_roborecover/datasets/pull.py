@@ -16,7 +16,7 @@ from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.hf_api import RepoFile
 
 from lerobot_roborecover.datasets.contents import MAX_FILE_BYTES, check_file, check_names
-from lerobot_roborecover.datasets.retries import again
+from lerobot_roborecover.datasets.retries import retry
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
     MANIFEST_FILE,
@@ -27,7 +27,7 @@ from lerobot_roborecover.datasets.schema import (
 from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, read_trajectories
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir, check_new
 
 _EVALUATION = (f"{FOLDER}/{MANIFEST_FILE}", f"{FOLDER}/{SCENARIOS_FILE}")
 _LIMITS = {_EVALUATION[0]: MAX_MANIFEST_BYTES, _EVALUATION[1]: MAX_PARQUET_BYTES}
@@ -63,9 +63,9 @@ def pull_dataset(
     check_new(out)
     where = f"Hub dataset {repo_id}" + (f" at revision {revision!r}" if revision else "")
     api = HfApi()
-    info = again(lambda: api.dataset_info(repo_id, revision=revision), where)
+    info = retry(lambda: api.dataset_info(repo_id, revision=revision), where)
     commit = str(info.sha)
-    entries = again(
+    entries = retry(
         lambda: [
             e
             for e in api.list_repo_tree(repo_id, recursive=True, revision=commit, repo_type="dataset")
@@ -79,14 +79,14 @@ def pull_dataset(
     free = shutil.disk_usage(out.parent).free
     if size > free:
         raise ScenarioError(f"{where} has {size / 1e9:.1f} GB; {out.parent} has {free / 1e9:.1f} GB free")
-    snapshot = again(
+    snapshot = retry(
         lambda: snapshot_download(
             repo_id, repo_type="dataset", revision=commit, allow_patterns=[e.path for e in entries]
         ),
         f"{where}: downloading",
     )
     try:
-        with new_folder(out) as folder:
+        with atomic_dir(out) as folder:
             for entry in entries:
                 target = folder / entry.path
                 target.parent.mkdir(parents=True, exist_ok=True)

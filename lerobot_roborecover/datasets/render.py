@@ -22,7 +22,7 @@ from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import check_new, new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir, check_new
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
 _EPISODES_PER_SHARD = 10
@@ -73,7 +73,7 @@ def render_dataset(
         done += 1
         progress(done, len(shards))
     paths = [path for _, _, path, _ in shards]
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         if episodes:
             # In a process that has LeRobot already.
             pool.call(_join, paths, [len(s.prefix) for s in scenarios], folder)
@@ -119,7 +119,7 @@ def _look(scenarios: Sequence[Scenario]) -> None:
 def _render_shard(begin: int, scenarios: Sequence[Scenario], path: Path, episodes: bool) -> None:
     simulator = simulator_of_worker()
     last: list[LastFrames] = []
-    with new_folder(path) as folder:
+    with atomic_dir(path) as folder:
         if episodes:
             drawn = (render_prefix(simulator, scenario, last) for scenario in scenarios)
             write_lerobot_dataset(folder, scenarios, drawn, round(simulator.control_hz), first_index=begin)

@@ -34,7 +34,7 @@ from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,9 @@ def _repair_scenarios(
     manifests = [found.manifest for found in sets]
     total = sum(len(found) for found in sets)
     lines = [
-        f"{counted(len(episodes), 'episode')} found again in {counted(len(sets), 'source')} by "
+        f"{pluralize(len(episodes), 'episode')} found again in {pluralize(len(sets), 'source')} by "
         "their exact actions",
-        f"scenarios.parquet: {len(chosen)} of {counted(total, 'scenario')}, in the order of the episodes",
+        f"scenarios.parquet: {len(chosen)} of {pluralize(total, 'scenario')}, in the order of the episodes",
     ]
     if update is None:
         return Repaired((*lines, "dry run: nothing was changed"), False, tuple(names))
@@ -143,7 +143,7 @@ def _repair_scenarios(
         license=licenses.pop() if len(licenses) == 1 else None,
         frames=_last_frames(sources, chosen),
     )
-    return Repaired((*lines, f"{SCENARIO_INDEX}: {counted(moved, 'frame')} renumbered"), True, tuple(names))
+    return Repaired((*lines, f"{SCENARIO_INDEX}: {pluralize(moved, 'frame')} renumbered"), True, tuple(names))
 
 
 def _last_frames(sources: Sequence[str], scenarios: Sequence[Scenario]) -> Iterator[LastFrames]:
@@ -181,9 +181,9 @@ def _repair_trajectories(
             raise ScenarioError(f"two sources have different scenarios, or splits, under the id {link.id!r}")
         rows.append(replace(row, scenario_index=-1 if link is None else list(links).index(link.id)))
     lines = [
-        f"{counted(len(episodes), 'episode')} found again in {counted(len(sets), 'source')} by "
+        f"{pluralize(len(episodes), 'episode')} found again in {pluralize(len(sets), 'source')} by "
         "their exact actions",
-        f"{TRAJECTORIES_FILE}: {counted(len(rows), 'trajectory')} of {counted(len(links), 'scenario')}",
+        f"{TRAJECTORIES_FILE}: {pluralize(len(rows), 'trajectory')} of {pluralize(len(links), 'scenario')}",
     ]
     if update is None:
         return Repaired((*lines, "dry run: nothing was changed"), False)
@@ -199,7 +199,7 @@ def _repair_trajectories(
         description=" ".join(dict.fromkeys(m.get("description", "") for m in manifests)).strip(),
         license=licenses.pop() if len(licenses) == 1 else None,
     )
-    return Repaired((*lines, f"{SCENARIO_INDEX}: {counted(moved, 'frame')} renumbered"), True)
+    return Repaired((*lines, f"{SCENARIO_INDEX}: {pluralize(moved, 'frame')} renumbered"), True)
 
 
 def _one(number: int, index: np.ndarray) -> int:

@@ -34,7 +34,7 @@ class HubUnreachable(ScenarioError):
 _LOGIN = "Log in with `hf auth login`, or set HF_TOKEN to a token that may do this"
 
 
-def again[T](
+def retry[T](
     call: Callable[[], T],
     what: str,
     passing: tuple[type[Exception], ...] = (),

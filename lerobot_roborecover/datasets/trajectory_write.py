@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import (
     KINDS,
@@ -35,7 +35,7 @@ from lerobot_roborecover.scenario import (
     ScenarioError,
     Task,
 )
-from lerobot_roborecover.whole import new_folder, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
 
 type Frame = Mapping[str, np.ndarray]
 """One time step by LeRobot feature name, as `episodes.to_frame` gives it."""
@@ -117,7 +117,7 @@ def write_trajectories(
     root = Path(root)
     if kind not in KINDS:
         raise ScenarioError(f"trajectory kind {kind!r} is not one of {', '.join(KINDS)}")
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         links, rows, labels = _write_episodes(folder, kind, trajectories, fps, splits or {})
         write_metadata(folder, kind, links, rows, labels=labels, description=description, license=license)
         also(folder)
@@ -255,4 +255,4 @@ def write_metadata(
         raise ScenarioError(
             f"{TRAJECTORIES_FILE} would exceed {MAX_TRAJECTORIES_BYTES} bytes; split the dataset"
         )
-    write_whole(root / FOLDER / TRAJECTORIES_FILE, text + "\n")
+    atomic_write(root / FOLDER / TRAJECTORIES_FILE, text + "\n")

@@ -18,10 +18,10 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
-from lerobot_roborecover.file_locks import is_still_at, lock_file
-from lerobot_roborecover.journal import open_locked
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import check_unlocked, forget_stale, new_folder, sync_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir, check_unlocked, remove_stale, sync_folder
+from lerobot_roborecover.utils.file_locks import is_still_at, lock_file
+from lerobot_roborecover.utils.journal import open_locked
 
 PENDING = ".roborecover-update"
 _LIST, _LOCK = "update.json", f"{PENDING}.lock"
@@ -71,7 +71,7 @@ def update_folder(root: Path) -> Generator[FolderUpdate]:
     with open_locked(root / _LOCK, "ab"):
         finish_update(root)
         try:
-            with new_folder(root / PENDING) as folder:
+            with atomic_dir(root / PENDING) as folder:
                 folder.mkdir()
                 update = FolderUpdate(root, folder)
                 yield update
@@ -94,7 +94,7 @@ def finish_update(root: Path) -> None:
         ScenarioError: it cannot be finished.
     """
     if not os.path.lexists(root):
-        forget_stale(root)
+        remove_stale(root)
         return
     pending = root / PENDING
     try:

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, write_frames
 from lerobot_roborecover.datasets.frames import LastFrames
 from lerobot_roborecover.datasets.schema import (
@@ -32,7 +32,7 @@ from lerobot_roborecover.datasets.schema import (
 )
 from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import forget_stale, new_file, new_folder, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_file, atomic_write, remove_stale
 
 _ROWS_PER_GROUP = 64
 """Rows converted at a time: bounds memory where scenarios carry frames."""
@@ -108,10 +108,10 @@ def _write_folder(
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f".{FRAMES_FOLDER}.{os.getpid()}.tmp"
     shutil.rmtree(temporary, ignore_errors=True)
-    forget_stale(folder / FRAMES_FOLDER)
+    remove_stale(folder / FRAMES_FOLDER)
     try:
         names = write_frames(temporary, frames)
-        with new_file(folder / SCENARIOS_FILE) as path, open(path, "wb") as file:
+        with atomic_file(folder / SCENARIOS_FILE) as path, open(path, "wb") as file:
             _write_parquet(file, scenarios)
         shutil.rmtree(folder / FRAMES_FOLDER, ignore_errors=True)
         if names:
@@ -133,7 +133,7 @@ def _write_folder(
         },
     }
     text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
-    write_whole(folder / MANIFEST_FILE, text)
+    atomic_write(folder / MANIFEST_FILE, text)
 
 
 def _write_dataset(
@@ -149,7 +149,7 @@ def _write_dataset(
 
     if fps is None:
         raise ScenarioError("episodes need a frame rate; pass fps, e.g. the simulator's control_hz")
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         write_lerobot_dataset(folder, scenarios, episodes, fps)
         _write_folder(folder / FOLDER, scenarios, description, license, frames)
 

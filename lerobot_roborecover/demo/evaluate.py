@@ -12,9 +12,9 @@ from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
-from lerobot_roborecover.rounding import policy_kernels
-from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
-from lerobot_roborecover.words import output_end
+from lerobot_roborecover.evaluation.progress import LogTail, ProgressLine, RunProgress
+from lerobot_roborecover.utils.determinism import policy_kernels
+from lerobot_roborecover.utils.text import output_end
 from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 _POLL_S = 0.5
@@ -67,7 +67,7 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
     Raises:
         DemoError: `lerobot-eval` failed, or left trials out; the message shows the end of its output.
     """
-    tail, tally = LogTail(settings.trial_log), Tally(start, ids, settings.trials)
+    tail, tally = LogTail(settings.trial_log), RunProgress(start, ids, settings.trials)
     progress = ProgressLine(start)
     tally.add(tail.read())
     folder = settings.out / start

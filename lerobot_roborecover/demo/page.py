@@ -9,7 +9,7 @@ from pathlib import Path
 from lerobot_roborecover.analysis.logs import Study, read_study
 from lerobot_roborecover.analysis.report import Extras, write_report
 from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 
 INTRODUCTION = (
     "Each scenario replays a recorded rollout up to the point where it had gone wrong, and hands the scene "

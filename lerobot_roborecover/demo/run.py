@@ -14,10 +14,10 @@ from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo.evaluate import eval_command, evaluate
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.settings import DemoSettings, hold_folder
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.evaluation.progress import RunProgress
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.trials.progress import Tally
 
 STARTS = ("recovery", "initial")
 
@@ -47,7 +47,7 @@ def _run(settings: DemoSettings, platform: str, scenarios: Sequence[Scenario]) -
     _say(f"{len(ids)} scenarios, {settings.trials} trial(s) each, from recovery and from initial starts")
     for start in STARTS:
         evaluate(settings, platform, ids, start)
-    tallies = [Tally(start, ids, settings.trials) for start in STARTS]
+    tallies = [RunProgress(start, ids, settings.trials) for start in STARTS]
 
     def wanted(row: TrialRow) -> bool:
         return any(tally.wanted(asdict(row)) for tally in tallies)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
-from lerobot_roborecover.env.identity import policy_identity
-from lerobot_roborecover.journal import InUseError, open_locked
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.policies.identity import policy_identity
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.journal import InUseError, open_locked
 
 SCENARIOS = "metaworld_starter"
 TRIALS = 1
@@ -96,7 +96,7 @@ def claim_folder(settings: DemoSettings) -> None:
                     f"not {fixed[other[0]]!r}. Give this one a folder of its own: --out FOLDER"
                 )
             return
-        write_whole(path, json.dumps(fixed, indent=2) + "\n")
+        atomic_write(path, json.dumps(fixed, indent=2) + "\n")
     except (OSError, ValueError, AttributeError) as err:
         raise DemoError(
             f"cannot use {settings.out} for the demo's output: {err}. Choose another with --out"

@@ -32,7 +32,7 @@ def examine(platform: str = "all") -> list[Check]:
     """
     required = platform != "all"
     wanted = (
-        [platform_named(platform).member_of(())]
+        [platform_named(platform).resolve(())]
         if required
         else [p for p in all_platforms() if p.required_versions]
     )

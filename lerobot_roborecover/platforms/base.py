@@ -65,7 +65,7 @@ class SimulatorSetup:
     """Which one, where the env type serves several."""
 
 
-class FilmedEnvConfig:
+class VideoEnvMixin:
     """A platform's env config, as far as recovery evaluation decides it where the env type is registered."""
 
     videos: bool
@@ -103,7 +103,7 @@ class Platform:
     """Several scenarios come of one trajectory: statistics resample trajectories, not scenarios."""
     apart: ClassVar[tuple[str, ...]] = ("trajectory", "record")
     """What may not lie on both sides of a split (`roborecover split`), where nobody says otherwise."""
-    turned_pictures: ClassVar[bool] = False
+    images_rotated_180: ClassVar[bool] = False
     """Observed pictures leave the simulator rotated by 180 degrees."""
     sizes_pictures: ClassVar[bool] = True
     """`picture_options` decides how large pictures are; elsewhere a task's own configuration does."""
@@ -133,7 +133,7 @@ class Platform:
     env_defaults: ClassVar[Mapping[str, Any]] = {}
     """Options of that env type that name this platform, nested as in a configuration file."""
 
-    def member_of(self, options: Sequence[str]) -> Platform:
+    def resolve(self, options: Sequence[str]) -> Platform:
         """The platform that options of the env type choose, where it serves several.
 
         Args:
@@ -293,7 +293,7 @@ class Platform:
         """(A,) float64 that keeps the robot where it is while the scene settles."""
         return np.zeros(self.action_widths[0])
 
-    def cannot_drive(self, task: Task) -> str:
+    def unsupported_reason(self, task: Task) -> str:
         """Why the scripted drivers cannot do a task at all; empty where they can try."""
         return ""
 
@@ -370,7 +370,7 @@ class Platform:
 
     def upright(self, picture: np.ndarray) -> np.ndarray:
         """An observed picture (H, W, 3) as people, and policies behind LeRobot's processors, see it."""
-        return picture[::-1, ::-1] if self.turned_pictures else picture
+        return picture[::-1, ::-1] if self.images_rotated_180 else picture
 
     def process_observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """LeRobot's own processing of the platform's observations, after `preprocess_observation`."""
@@ -415,7 +415,7 @@ class Platform:
         """
         return []
 
-    def salt(self, options: Mapping[str, Any]) -> dict[str, str | None]:
+    def environment_fingerprint(self, options: Mapping[str, Any]) -> dict[str, str | None]:
         """What else of this machine decides a replay: folders of assets, named by options or environment."""
         return {}
 

@@ -25,7 +25,7 @@ from lerobot_roborecover.platforms import Platform, Simulator, platform_named
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.probe import answer, last_answer
 from lerobot_roborecover.platforms.simulator import ShowsProgress
-from lerobot_roborecover.platforms.walk import follow, walk
+from lerobot_roborecover.platforms.stepping import follow, iter_steps
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Pose, Reset, Rollout, Task
 
 STEPS = 40
@@ -138,7 +138,7 @@ def run(simulator: Simulator, task: Task, reset: Reset, actions: np.ndarray, *, 
     """
     hashes, success, parts = [], [], []
     tell = getattr(simulator, "state_parts", None)
-    for step in walk(simulator, Rollout(task, reset, actions)):
+    for step in iter_steps(simulator, Rollout(task, reset, actions)):
         hashes.append(simulator.state_sha256())
         if tell is not None:
             parts.append(tell())
@@ -259,7 +259,7 @@ def _snapshots(simulator: Simulator, task: Task, reset: Reset, actions: np.ndarr
     name, middle = f"{task.name}: snapshots", len(actions) // 2
     try:
         kept = b""
-        for step in walk(simulator, Rollout(task, reset, actions)):
+        for step in iter_steps(simulator, Rollout(task, reset, actions)):
             if step == middle:
                 kept = simulator.snapshot()
         simulator.reset(task, reset)

@@ -11,13 +11,13 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import FilmedEnvConfig, SimulatorSetup, first_camera, no_video
+from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin, first_camera, no_video
 
 OBS_TYPES = ("state", "pixels_agent_pos")
 
 
 @dataclass
-class PlainConfig(EnvConfig, FilmedEnvConfig):
+class StateEnvConfig(EnvConfig, VideoEnvMixin):
     """State vectors, and one square picture where asked for. A platform subclasses it and says how wide."""
 
     action_width: ClassVar[int]
@@ -69,12 +69,12 @@ class PlainConfig(EnvConfig, FilmedEnvConfig):
         return SimulatorSetup(self.gym_kwargs, self.gym_kwargs, picture)
 
 
-def plain_config(action: int, **state: int) -> type[PlainConfig]:
+def plain_config(action: int, **state: int) -> type[StateEnvConfig]:
     """A platform's configuration.
 
     Args:
         action: values in an action.
         state: values of `agent_pos` and `environment_state`, by name.
     """
-    members = {"action_width": action, "state_widths": state, "__doc__": PlainConfig.__doc__}
-    return dataclass(type("Config", (PlainConfig,), members))
+    members = {"action_width": action, "state_widths": state, "__doc__": StateEnvConfig.__doc__}
+    return dataclass(type("Config", (StateEnvConfig,), members))

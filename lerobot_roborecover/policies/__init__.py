@@ -1,1 +1,2 @@
-"""Policies as the fast runner holds them: what a host offers, and the host of a LeRobot checkpoint."""
+"""Loads policies and runs them in batches: a LeRobot checkpoint, a remote policy, or the composite policy
+of an intervention."""

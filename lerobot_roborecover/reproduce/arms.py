@@ -13,22 +13,22 @@ from typing import Any
 
 import yaml
 
-from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing, agreement
+from lerobot_roborecover.analysis.agreement import AgreementVerdict, ScoreAgreement, agreement
 from lerobot_roborecover.analysis.first_states import with_first_states
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
-from lerobot_roborecover.env.trial_log import read_log
-from lerobot_roborecover.env.trial_row import TrialRow
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.base import ENV_PREFIX
 from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
 from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
 from lerobot_roborecover.scenario import ScenarioError, Start
 from lerobot_roborecover.study.child import run_module
-from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 INITIAL, RECOVERY = str(Start.INITIAL), str(Start.RECOVERY)
 _TAKEN = ("--env.start", "--env.trial_log", "--output_dir", "--eval.n_episodes", "--config_path")
@@ -167,7 +167,7 @@ class ReproductionResult:
     @property
     def confirmed(self) -> bool:
         """Whether the initial arm shows that the policy is set up as its score says."""
-        return self.check.standing in (Standing.AGREES, Standing.HIGHER)
+        return self.check.standing in (AgreementVerdict.AGREES, AgreementVerdict.HIGHER)
 
 
 def run_arms(plan: ReproductionPlan, say: Callable[[str], None] = print) -> ReproductionResult:
@@ -187,7 +187,7 @@ def run_arms(plan: ReproductionPlan, say: Callable[[str], None] = print) -> Repr
     makers = plan.checkpoint.of_makers(list(scenarios))
     beside = None if makers is None else (makers, agreement(rate, makers.rate, plan.margin))
     recovery = None
-    if check.standing is not Standing.LOWER or plan.anyway:
+    if check.standing is not AgreementVerdict.LOWER or plan.anyway:
         recovery = _run(plan, RECOVERY, scenarios, say)
     against = None
     if recovery is not None:
@@ -212,7 +212,7 @@ def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callab
         status = run_module("lerobot_roborecover.cli.main", argv, online)
         before = record.get("seconds", 0.0) if record.get("identity") == identity else 0.0
         seconds = before + time.monotonic() - began
-        write_whole(
+        atomic_write(
             done,
             json.dumps({"argv": argv, "identity": identity, "seconds": seconds, "finished": status == 0}),
         )

@@ -10,12 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover import __version__
-from lerobot_roborecover.analysis.agreement import ScoreAgreement, Standing
+from lerobot_roborecover._version import __version__
+from lerobot_roborecover.analysis.agreement import AgreementVerdict, ScoreAgreement
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_markdown
-from lerobot_roborecover.env.render_device import egl_devices
-from lerobot_roborecover.outputs import check_page
 from lerobot_roborecover.reproduce.arms import (
     INITIAL,
     RECOVERY,
@@ -23,8 +21,10 @@ from lerobot_roborecover.reproduce.arms import (
     ReproductionPlan,
     ReproductionResult,
 )
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import check_page
 from lerobot_roborecover.workers.capacity import usable_cores
+from lerobot_roborecover.workers.render_device import egl_devices
 
 SCHEMA = 1
 MARKDOWN, JSON = "reproduction.md", "reproduction.json"
@@ -34,8 +34,8 @@ def write_record(result: ReproductionResult) -> tuple[Path, Path]:
     """Writes both files into the plan's folder; returns their paths."""
     out = result.plan.out
     check_record(result.plan)
-    write_whole(out / JSON, json.dumps(_plain(record(result)), indent=1, ensure_ascii=False) + "\n")
-    write_whole(out / MARKDOWN, page(result))
+    atomic_write(out / JSON, json.dumps(_plain(record(result)), indent=1, ensure_ascii=False) + "\n")
+    atomic_write(out / MARKDOWN, page(result))
     return out / MARKDOWN, out / JSON
 
 
@@ -60,13 +60,13 @@ def verdict(result: ReproductionResult) -> str:
     check, margin = result.check, 100 * result.plan.margin
     ours, theirs = (_percent(e) for e in (check.measured, check.published))
     gap = f"{_percent(check.difference, sign=True)} points"
-    if check.standing is Standing.UNPUBLISHED:
+    if check.standing is AgreementVerdict.UNPUBLISHED:
         return (
             f"**Not confirmed.** Initial states {ours} %. No score is published to hold this against, so "
             "nothing shows that the policy is set up as its makers had it."
         )
     said = f"Initial states {ours} % here, {theirs} % published: {gap}."
-    if check.standing is Standing.LOWER:
+    if check.standing is AgreementVerdict.LOWER:
         end = (
             "The recovery arm was run all the same (--anyway); do not take it for this policy's."
             if result.recovery
@@ -74,12 +74,12 @@ def verdict(result: ReproductionResult) -> str:
             "docs/policies.md), or say --anyway."
         )
         return f"**Not reproduced.** {said} The interval leaves zero out. {end}"
-    if check.standing is Standing.UNDECIDED:
+    if check.standing is AgreementVerdict.UNDECIDED:
         return (
             f"**Not confirmed.** {said} No difference is shown, but a loss of {margin:g} points could hide "
             "in so few trials. More scenarios or trials narrow the interval."
         )
-    if check.standing is Standing.HIGHER:
+    if check.standing is AgreementVerdict.HIGHER:
         return f"**Confirmed.** {said} It is above; the tasks may be easier ones than those published on."
     return f"**Confirmed.** {said} A loss of {margin:g} points would have been seen."
 
@@ -147,7 +147,7 @@ def _scores(result: ReproductionResult) -> Table:
     for name, arm in (("initial states", result.initial), ("recovery (RSR)", result.recovery)):
         if arm is not None and name not in told:
             rows.append(
-                (name, arm.summary.rsr, None, None, str(Standing.UNPUBLISHED), "nothing is published")
+                (name, arm.summary.rsr, None, None, str(AgreementVerdict.UNPUBLISHED), "nothing is published")
             )
     return Table(
         "scores", "Scores",

@@ -10,9 +10,9 @@ from typing import Any
 
 import yaml
 
-from lerobot_roborecover.env.intervention_options import POLICY_TYPE
+from lerobot_roborecover.evaluation.spec import RunSpec
+from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
 from lerobot_roborecover.study.definition import StudyDefinition
-from lerobot_roborecover.trials.spec import RunSpec
 
 STARTS = ("recovery", "initial")
 

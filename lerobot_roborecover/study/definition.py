@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 DEFINITION_FILE = "study.json"
 OUTCOMES_FILE = "outcomes.csv"
@@ -143,12 +143,12 @@ def write_definition(study: StudyDefinition) -> Path:
         **({"dataset": study.dataset} if study.dataset else {}),
         **({"policies_folder": study.policies_folder} if study.policies_folder else {}),
     }
-    write_whole(path, json.dumps(found, indent=2) + "\n")
+    atomic_write(path, json.dumps(found, indent=2) + "\n")
     return path
 
 
 def _check(path: Path, study: StudyDefinition) -> None:
-    from lerobot_roborecover.env.intervention_options import MODES
+    from lerobot_roborecover.policies.interventions.options import MODES
 
     def wrong(name: str, value: object, wanted: str) -> ScenarioError:
         return ScenarioError(f"{path}, field {name}: {value!r:.200}; it must be {wanted}")

@@ -14,7 +14,8 @@ from typing import Any
 from lerobot_roborecover.analysis.make import Gallery, Report, report
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.rounding import has_kernels
+from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
+from lerobot_roborecover.evaluation.sizes import SLOT_GB
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms, report_command
 from lerobot_roborecover.study.child import CANNOT_START, run_module, stop_running
@@ -26,10 +27,9 @@ from lerobot_roborecover.study.outcomes import (
     outcomes_of,
     read_outcomes,
 )
-from lerobot_roborecover.trials.own_log import claim_log, identity_of_run
-from lerobot_roborecover.trials.sizes import SLOT_GB
-from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.words import output_end
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.determinism import has_kernels
+from lerobot_roborecover.utils.text import output_end
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
 DONE_FILE = "done.json"
@@ -91,7 +91,7 @@ def evaluate(
         if not _finished(arm, ids):
             claim_log(arm.log, _identity(arm), say)
             run_arm(arm, study)
-            write_whole(arm.out / DONE_FILE, _what_ran(arm, ids))
+            atomic_write(arm.out / DONE_FILE, _what_ran(arm, ids))
         return time.monotonic() - began
 
     with ThreadPoolExecutor(jobs) as pool:

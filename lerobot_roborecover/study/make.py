@@ -15,15 +15,15 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
 from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
-from lerobot_roborecover.journal import append_records
 from lerobot_roborecover.policies.ship import ship
-from lerobot_roborecover.rounding import KERNELS
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
 from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
 from lerobot_roborecover.study.stages import CHECKPOINT, stages
-from lerobot_roborecover.whole import new_folder, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
+from lerobot_roborecover.utils.determinism import KERNELS
+from lerobot_roborecover.utils.journal import append_records
 
 
 def make(
@@ -74,14 +74,14 @@ def chain_for(out: Path, recipe: StudyRecipe) -> ChainConfig:
     """The scenarios' recipe, written anew so that it works below `out`."""
     out.mkdir(parents=True, exist_ok=True)
     chain = Path(recipe.chain)
-    write_whole(out / chain.name, chain.read_text().replace(recipe.chain_root, str(out)))
+    atomic_write(out / chain.name, chain.read_text().replace(recipe.chain_root, str(out)))
     return read_config(out / chain.name)
 
 
 def assemble(out: Path, recipe: StudyRecipe, *, shipped: bool = False) -> StudyDefinition:
     """Copies what an evaluation needs into `out/data` and writes its definition; `shipped` as `stages`."""
     data = out / "data"
-    with new_folder(data, replace=True) as folder:
+    with atomic_dir(data, replace=True) as folder:
         _assemble(out, recipe, folder, shipped=shipped)
     return read_definition(data)
 

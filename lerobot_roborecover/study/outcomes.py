@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import StudyArm
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_roborecover.curation.pipeline.config import read_options
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.definition import IN_CHECKOUT
 

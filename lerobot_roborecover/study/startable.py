@@ -8,10 +8,10 @@ from collections.abc import Sequence
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_roborecover.env.command_line import run_with_arguments
+from lerobot_roborecover.evaluation.loading import load_host
+from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
+from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.study.child import CANNOT_START
-from lerobot_roborecover.trials.load import load_host
-from lerobot_roborecover.trials.runner import RecoveryEvalConfig, host_spec
 
 
 def _load(cfg: RecoveryEvalConfig) -> int:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_row import Protocol, make_row
+from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.study.arms import StudyArm, arms
 from lerobot_roborecover.study.definition import StudyDefinition
 from lerobot_roborecover.study.outcomes import read_outcomes
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.results import Results
@@ -53,7 +53,7 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         arm = names[label]
         row = make_row(
             scenarios[scenario_id],
-            Protocol(arm.start, 0, arm.name, None, None, options=dict(study.env)),
+            EvalProtocol(arm.start, 0, arm.name, None, None, options=dict(study.env)),
             dataset=study.root.name,
             dataset_revision=None,
             trial=trial,
@@ -69,7 +69,7 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         )
         by_label[label].append(json.dumps(asdict(row)))
     for arm in found:
-        write_whole(arm.log, "".join(f"{line}\n" for line in by_label[arm.label]))
+        atomic_write(arm.log, "".join(f"{line}\n" for line in by_label[arm.label]))
     return found
 
 

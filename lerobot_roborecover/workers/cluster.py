@@ -13,12 +13,12 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lerobot_roborecover import __version__
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.platforms.versions import installed, required
+from lerobot_roborecover.workers.backend import Backend, WorkerStartup
 from lerobot_roborecover.workers.messages import Reply, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
-from lerobot_roborecover.workers.workplace import Opening, Workplace
 
 try:
     import ray
@@ -77,7 +77,7 @@ def wait_for_calls(handles: list[Any], timeout_s: float) -> Collection[Any]:
     return ready
 
 
-class RemotePart:
+class RestartableActor:
     """An actor that is made again when it is lost; one call under way at a time.
 
     Args:
@@ -149,7 +149,7 @@ class SlotActor:
         config: what the slot serves.
         timeout_s: its watchdog.
         turn: the slot's number.
-        environment, first: of `Opening`.
+        environment, first: of `WorkerStartup`.
     """
 
     def __init__(self, config: SlotConfig, timeout_s: float, turn: int, environment: Any, first: Any):
@@ -179,13 +179,13 @@ class SlotActor:
         self._slot.end()
 
 
-class RaySlot(RemotePart):
+class RaySlot(RestartableActor):
     """A slot on the cluster.
 
     Args:
         make: makes the actor.
         platform: of its simulator.
-        check: of `Opening`.
+        check: of `WorkerStartup`.
     """
 
     wait = staticmethod(wait_for_calls)
@@ -243,7 +243,7 @@ def decisive_versions(platform: str) -> dict[str, str]:
     return found | {name: installed(name) or "" for name in (required(platform) if platform else ())}
 
 
-def _knock(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Raises an `OSError` where nobody answers at HOST:PORT, which Ray itself would try for minutes."""
     host, _, port = address.rpartition(":")
     if "/" not in host and port.isdigit():
@@ -261,12 +261,12 @@ class Cluster:
         OptionError: there is no such cluster.
     """
 
-    def __init__(self, workplace: Workplace, pool: SlotPool):
+    def __init__(self, workplace: Backend, pool: SlotPool):
         self._workplace, self._pool = workplace, pool
         if not ray.is_initialized():
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             try:
-                _knock(workplace.address)
+                _check_reachable(workplace.address)
                 ray.init(address=workplace.address, log_to_driver=False)
             except (OSError, RuntimeError, ValueError) as err:
                 option = workplace.option
@@ -299,7 +299,7 @@ class Cluster:
             )
         return slots
 
-    def make_slots(self, opening: Opening) -> None:
+    def make_slots(self, opening: WorkerStartup) -> None:
         """Has the pool's slots made on the cluster, one CPU each, spread over its nodes."""
         actor = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(SlotActor)
 

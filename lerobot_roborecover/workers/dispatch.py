@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lerobot_roborecover.workers.messages import More, SlotFailure
-from lerobot_roborecover.workers.slots import MOST_LOSSES, ProcessSlot
+from lerobot_roborecover.workers.messages import InProgress, SlotFailure
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, ProcessSlot
 
 _POLL_S = 1.0
 
@@ -26,7 +26,7 @@ class _Handed[Item]:
     """How often the machine that it was done on was lost."""
 
 
-def each[Item](
+def map_unordered[Item](
     slots: Sequence[ProcessSlot],
     command: str,
     take: Take[Item],
@@ -36,7 +36,7 @@ def each[Item](
 ) -> Iterator[tuple[Item, Any]]:
     """Replies as they come, with what they are of; a `SlotFailure` where the simulator failed.
 
-    An item whose machine is lost is done again elsewhere, `MOST_LOSSES` times in all. Whoever stops asking
+    An item whose machine is lost is done again elsewhere, `MAX_ATTEMPTS` times in all. Whoever stops asking
     ends what is under way.
 
     Args:
@@ -75,16 +75,16 @@ def each[Item](
                     slot.opened()
                     continue
                 reply = slot.receive()
-                if isinstance(reply, More):
+                if isinstance(reply, InProgress):
                     slot.send(command, None)
                     continue
                 handed = busy.pop(k)
                 if isinstance(reply, SlotFailure) and reply.kind == "lost":
                     handed.losses += 1
-                    if handed.losses < MOST_LOSSES:
+                    if handed.losses < MAX_ATTEMPTS:
                         waiting.append(handed)
                         continue
-                    reply = replace(reply, message=f"lost {MOST_LOSSES} times, last: {reply.message}")
+                    reply = replace(reply, message=f"lost {MAX_ATTEMPTS} times, last: {reply.message}")
                 if fresh:
                     slot.end()
                 yield handed.item, reply
@@ -106,7 +106,7 @@ def _ready(slots: Sequence[ProcessSlot], parties: Sequence[int]) -> list[int]:
     ]
 
 
-def in_order[Item](
+def map_ordered[Item](
     slots: Sequence[ProcessSlot], command: str, items: Sequence[Item], argument: Callable[[Item], Any]
 ) -> Iterator[Any]:
     """Replies in the order of the items, with few of them ahead of the caller: they are large.
@@ -128,7 +128,7 @@ def in_order[Item](
         return handed - 1
 
     while given < len(items):
-        for number, reply in each(slots, command, take, lambda number: argument(items[number])):
+        for number, reply in map_unordered(slots, command, take, lambda number: argument(items[number])):
             waiting[number] = reply
             while given in waiting:
                 yield waiting.pop(given)

@@ -22,10 +22,10 @@ from typing import Any
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.workers.dispatch import each, in_order
+from lerobot_roborecover.workers.backend import LOCAL, Backend
+from lerobot_roborecover.workers.dispatch import map_ordered, map_unordered
 from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import ProcessSlot, SlotPool
-from lerobot_roborecover.workers.workplace import HERE, Workplace
 
 SERVER = f"{__name__}:JobServer"
 
@@ -47,7 +47,7 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Raised:
+class JobError:
     """Reply to a job: what the function raised."""
 
     error: Exception
@@ -60,7 +60,7 @@ class Raised:
         return str(self.error) if plain else f"{type(self.error).__name__}: {self.error}"
 
 
-type Outcome = Done | Raised | SlotFailure
+type Outcome = Done | JobError | SlotFailure
 
 
 class JobServer:
@@ -83,7 +83,7 @@ class JobServer:
             self._simulator = make_simulator(self._config.platform, **self._config.options)
         return self._simulator
 
-    def answer(self, command: str, argument: Job) -> Done | Raised:
+    def answer(self, command: str, argument: Job) -> Done | JobError:
         """Runs a job; the only command is `run`."""
         assert command == "run", command
         try:
@@ -92,7 +92,7 @@ class JobServer:
             return Done(work(*argument.arguments))
         except Exception as err:
             traceback.print_exc()
-            return Raised(_portable(err))
+            return JobError(_portable(err))
 
     def close(self) -> None:
         """Closes the simulator."""
@@ -136,7 +136,7 @@ class JobPool:
         *,
         limit_s: float | None = None,
         fresh: bool = False,
-        workplace: Workplace = HERE,
+        workplace: Backend = LOCAL,
     ):
         self.platform, self.options = platform, dict(options or {})
         self._asked, self._fresh, self._workplace = workers, fresh, replace(workplace, count="workers")
@@ -174,7 +174,7 @@ class JobPool:
         def take(_last: list[I] | None, _busy: list[list[I]]) -> list[I] | None:
             return next(([item] for item in waiting), None)
 
-        for (item,), reply in each(
+        for (item,), reply in map_unordered(
             self._slots(len(first)), "run", take, lambda one: Job(name, arguments(one[0])), fresh=self._fresh
         ):
             yield item, reply
@@ -194,7 +194,7 @@ class JobPool:
         for item, outcome in self.outcomes(work, items, arguments):
             yield item, _value(outcome)
 
-    def in_order[I](
+    def map_ordered[I](
         self,
         work: Callable[..., Any],
         items: Sequence[I],
@@ -202,7 +202,7 @@ class JobPool:
     ) -> Iterator[Any]:
         """The results in the order of the items, with few of them ahead of the caller: see `run`."""
         name, slots = _name_of(work), self._slots(min(self._most(), len(items)) if items else 0)
-        for outcome in in_order(slots, "run", items, lambda item: Job(name, arguments(item))):
+        for outcome in map_ordered(slots, "run", items, lambda item: Job(name, arguments(item))):
             yield _value(outcome)
 
     def call(self, work: Callable[..., Any], *arguments: Any) -> Any:
@@ -220,7 +220,7 @@ class JobPool:
 
 
 def _value(outcome: Outcome) -> Any:
-    if isinstance(outcome, Raised):
+    if isinstance(outcome, JobError):
         raise outcome.error
     if isinstance(outcome, SlotFailure):
         raise SimulatorError(

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lerobot_roborecover.replay import Handoff
+from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import TrialStart
 
 
@@ -31,7 +31,7 @@ class SlotConfig:
     """How actions after the handoff are read, for simulators that have more than one way."""
     environment: Mapping[str, str | None] = field(default_factory=dict)
     """Environment variables of a worker process, beside the caller's; None unsets one."""
-    server: str = "lerobot_roborecover.env.slot_server:SlotServer"
+    server: str = "lerobot_roborecover.workers.slot_server:SlotServer"
     """`module:class` that answers the slot's commands, made with this configuration."""
     settings: dict[str, Any] = field(default_factory=dict)
     """What a server other than the usual one wants to know; plain JSON values."""
@@ -64,7 +64,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class More:
+class InProgress:
     """Reply in place of a result: it is under way; the same command without an argument goes on with it."""
 
 
@@ -136,7 +136,7 @@ class ActResult:
 
 
 @dataclass(frozen=True)
-class RollbackResult:
+class RollbackReply:
     """Reply to `rollback`: the simulation is some steps back."""
 
     observation: dict[str, Any]
@@ -165,4 +165,4 @@ class SlotFailure:
     message: str
 
 
-type Reply = EpisodeStart | StepResult | ActResult | RollbackResult | SlotFailure | np.ndarray | dict | None
+type Reply = EpisodeStart | StepResult | ActResult | RollbackReply | SlotFailure | np.ndarray | dict | None

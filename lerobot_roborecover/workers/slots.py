@@ -23,7 +23,7 @@ from typing import Any, Protocol, cast
 from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.transport import Channel, make_memory
 
-MOST_LOSSES = 3
+MAX_ATTEMPTS = 3
 """How often one thing may be lost with the machine that it was done on, before it is taken for the cause."""
 _LOG_TAIL_BYTES = 600
 _START_S = 60.0
@@ -324,7 +324,7 @@ class SlotPool:
     def ask(self, command: str) -> Reply:
         """The first slot's reply to a command that has no argument."""
         slot = self.slots(1)[0]
-        for _ in range(MOST_LOSSES):
+        for _ in range(MAX_ATTEMPTS):
             slot.send(command)
             reply = slot.receive()
             if not (isinstance(reply, SlotFailure) and reply.kind == "lost"):

@@ -13,7 +13,7 @@ import sys
 import traceback
 from multiprocessing.connection import Connection
 
-from lerobot_roborecover.signals import STOP_SIGNALS
+from lerobot_roborecover.utils.signals import STOP_SIGNALS
 from lerobot_roborecover.workers.messages import Command, Server, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.parent import end_with_parent
 from lerobot_roborecover.workers.transport import Channel

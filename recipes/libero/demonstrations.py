@@ -41,7 +41,7 @@ from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.platforms.starts import RELEASE_SEED
 from lerobot_roborecover.scenario import Pose, Reset, Task
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 from recipes.learned import LearnedPolicy
 
 FIRST_SEED, FIRST_SEED_AFTER = 20_000, 40_000
@@ -281,7 +281,7 @@ def write_dataset(
             features[name] = {"dtype": "image", "shape": rows.shape[1:], "names": axes}
     # LeRobot looks for pictures to embed row by row, which takes most of the time where there are none.
     embed = dataset_writer.embed_images if pictures else lambda rows: rows
-    with new_folder(root) as folder, patch.object(dataset_writer, "embed_images", embed):
+    with atomic_dir(root) as folder, patch.object(dataset_writer, "embed_images", embed):
         dataset = LeRobotDataset.create(
             repo_id=local_repo_id(root),
             root=folder,
@@ -308,7 +308,7 @@ def write_dataset(
 def _join(root: Path, parts: Sequence[Path]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    with new_folder(root) as folder:
+    with atomic_dir(root) as folder:
         aggregate_datasets([local_repo_id(p) for p in parts], local_repo_id(root), list(parts), folder)
 
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.starts import Starts, stream
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
+from lerobot_roborecover.utils.journal import Journal
 
 _SCHEMA = 1
 _INIT_STATES = 50

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from lerobot_roborecover.curation.collect.rollouts import ROLLOUTS_FILE, SCHEMA_VERSION
-from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
+from lerobot_roborecover.utils.journal import Journal
 
 type Counts = Mapping[str, Mapping[str, tuple[int, int]]]
 """Solved and tried rollouts by policy and suite."""

@@ -25,11 +25,11 @@ from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
-from lerobot_roborecover.platforms.walk import advance
+from lerobot_roborecover.platforms.stepping import advance
 from lerobot_roborecover.scenario import Pose, ScenarioError, Task
-from lerobot_roborecover.studio.teleop.client import Client
-from lerobot_roborecover.studio.teleop.serve import TeleopConfig
-from lerobot_roborecover.studio.teleop.starts import StartPoint, first_state
+from lerobot_roborecover.web.teleop.client import Client
+from lerobot_roborecover.web.teleop.serve import TeleopConfig
+from lerobot_roborecover.web.teleop.starts import StartPoint, first_state
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from recipes.scripted_operator import FILM_EVERY, OPERATOR, Stop, Turn, drive
 from recipes.scripted_operator import record as record_turns

@@ -25,8 +25,8 @@ from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.simulator import is_mark
-from lerobot_roborecover.recording import PERTURBED, Recorder, Steps
-from lerobot_roborecover.replay import hand_off, with_fingerprint
+from lerobot_roborecover.replay.handoff import hand_off, with_fingerprint
+from lerobot_roborecover.replay.recorder import PERTURBED, Recorder, Steps
 from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
 from recipes.libero.recipes import RECIPES, Recipe
 

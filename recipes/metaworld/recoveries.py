@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.journal import plain_records
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.experts import patient_expert
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.walk import advance
+from lerobot_roborecover.platforms.stepping import advance
 from lerobot_roborecover.scenario import Reset
+from lerobot_roborecover.utils.journal import plain_records
 from recipes.metaworld.dataset import (
     DEMO_TASKS,
     Episode,

@@ -23,7 +23,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.style import LINE, colour, dash, drawing, marker, svg_of
 from lerobot_roborecover.platforms.metaworld import PLATFORM
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 from recipes.commands import evaluate, roborecover
 from recipes.metaworld.dataset import STUDY_TASKS, Episode, create_dataset, save_episode
 from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_demonstrations
@@ -167,7 +167,7 @@ def make_mixtures(out: Path, wanted: dict[str, Mixture], pool: dict[str, int]) -
     for name, episodes in mixtures(*parts, recoveries, wanted).items():
         if name not in missing:
             continue
-        with new_folder(out / "mixtures" / name) as folder:
+        with atomic_dir(out / "mixtures" / name) as folder:
             dataset = create_dataset(folder)
             for task, episode in episodes:
                 save_episode(dataset, tasks[task], episode)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.walk import walk
+from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.scenario import Reset, Rollout
 
 _HELD = "the picture shows the object between the fingers"
@@ -52,6 +52,6 @@ def draw_sheets(out: Path, rows: list[dict[str, Any]], size: int = 240) -> None:
         actions = np.load(out / "actions" / f"{row['key']}.npy")
         wanted = {min(max(row["step"] + s, 0), len(actions)) for s in SHEET_STEPS}
         rollout = Rollout(PLATFORM.task(row["task"]), Reset(seed=row["seed"]), actions)
-        frames = [simulator.render() for step in walk(simulator, rollout) if step in wanted]
+        frames = [simulator.render() for step in iter_steps(simulator, rollout) if step in wanted]
         Image.fromarray(np.concatenate(frames, axis=1)).save(path)
     simulator.close()

@@ -21,9 +21,9 @@ import numpy as np
 from lerobot_roborecover.curation.collect.starts import parse_numbers
 from lerobot_roborecover.platforms.metaworld.experts import expert, patient_expert
 from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
-from lerobot_roborecover.studio.teleop.client import Client
-from lerobot_roborecover.studio.teleop.serve import TeleopConfig
-from lerobot_roborecover.studio.teleop.starts import StartPoint, first_state
+from lerobot_roborecover.web.teleop.client import Client
+from lerobot_roborecover.web.teleop.serve import TeleopConfig
+from lerobot_roborecover.web.teleop.starts import StartPoint, first_state
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from recipes.metaworld.dataset import STUDY_TASKS
 from recipes.scripted_operator import FILM_EVERY, OPERATOR, Attempt, Stop, Turn, drive

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import record
-from lerobot_roborecover.journal import append_records, plain_records
 from lerobot_roborecover.platforms.base import Driver
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.catalog import HORIZON
@@ -31,9 +30,10 @@ from lerobot_roborecover.platforms.metaworld.experts import (
     weak_grip_expert,
 )
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.walk import advance
-from lerobot_roborecover.replay import with_fingerprint
+from lerobot_roborecover.platforms.stepping import advance
+from lerobot_roborecover.replay.handoff import with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Source
+from lerobot_roborecover.utils.journal import append_records, plain_records
 from recipes.learned import LearnedPolicy
 from recipes.metaworld.dataset import DEMO_TASKS
 from recipes.metaworld.labels import recovery_point, watch

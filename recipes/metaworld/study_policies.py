@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.journal import append_records
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
+from lerobot_roborecover.utils.journal import append_records
 from recipes.metaworld.dataset import STUDY_TASKS, write_demonstrations
 from recipes.metaworld.initial_success import evaluate, table
 from recipes.training import Training
@@ -59,7 +59,7 @@ def make_demonstrations(out: Path) -> None:
     root = out / "demonstrations"
     if root.exists():
         return
-    with _timed(out, "demonstrations"), new_folder(root) as folder:
+    with _timed(out, "demonstrations"), atomic_dir(root) as folder:
         write_demonstrations(folder, STUDY_TASKS, EPISODES_PER_TASK)
 
 

@@ -67,7 +67,7 @@ def drive(expert: BlockExpert, task: str, fault: str, seed: int) -> Iterator[np.
     yield from expert.hold(4)
 
 
-def _knock(expert: BlockExpert, task: str, seed: int) -> Iterator[np.ndarray]:
+def _check_reachable(expert: BlockExpert, task: str, seed: int) -> Iterator[np.ndarray]:
     name = ORDERS[task][0]
     side, rotation = expert.approach(name)
     start, _ = expert.body(name)
@@ -219,7 +219,7 @@ FAULTS: dict[str, Fault] = {
         Stage.APPROACH,
         DeviationType.SCENE_CHANGE,
         "the gripper came in too low beside {first} and has pushed it away",
-        _knock,
+        _check_reachable,
     ),
     "misgrasp": Fault(
         Stage.APPROACH,

@@ -18,10 +18,10 @@ from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.platforms.robotwin.limits import STEP_LIMITS
 from lerobot_roborecover.platforms.robotwin.simulator import RobotwinSimulator
-from lerobot_roborecover.recording import Recorder
-from lerobot_roborecover.replay import with_fingerprint
+from lerobot_roborecover.replay.handoff import with_fingerprint
+from lerobot_roborecover.replay.recorder import Recorder
 from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 from recipes.robotwin.expert import BlockExpert
 from recipes.robotwin.faults import FAULTS, drive
@@ -145,7 +145,7 @@ def _attempt(work: Path, recipe: Recipe) -> Scenario | str:
     try:
         scenario = make(simulator, recipe)
     except (ScenarioError, SimulatorError, RuntimeError) as err:
-        write_whole(refused, str(err))
+        atomic_write(refused, str(err))
         return str(err)
     write_scenarios(kept, [scenario], description=_DESCRIPTION, license="Apache-2.0")
     return scenario
@@ -171,7 +171,7 @@ def main(argv: list[str] | None = None) -> int:
     recipes = [recipe for recipe in RECIPES if args.only in recipe.id]
     options = {"robotwin_root": args.robotwin_root, "obs_type": "state"}
     with JobPool("robotwin", options, args.jobs) as pool:
-        made = pool.in_order(_attempt, recipes, lambda recipe: (work, recipe))
+        made = pool.map_ordered(_attempt, recipes, lambda recipe: (work, recipe))
         for k, (recipe, scenario) in enumerate(zip(recipes, made, strict=True), start=1):
             if isinstance(scenario, str):
                 problems += 1

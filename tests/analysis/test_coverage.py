@@ -27,8 +27,8 @@ from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.summary import summarise
 from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.evaluation.progress import RunProgress
 from lerobot_roborecover.scenario import Start
-from lerobot_roborecover.trials.progress import Tally
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 
@@ -236,7 +236,7 @@ def test_one_estimator_behind_every_table(tmp_path, capsys):
     row = dict(zip([c.title for c in overall(plain).columns], overall(plain).rows[0], strict=True))
     (board,) = make_leaderboard(tmp_path / "logs").boards
     both = compare(read_study([str(path), str(other)]))
-    tally = Tally("recovery", {r.scenario_id for r in rows}, 3)
+    tally = RunProgress("recovery", {r.scenario_id for r in rows}, 3)
     tally.add([asdict(r) for r in rows])
     assert run.rsr == row["RSR %"] == board.entries[0].rsr == both.rsr[0]
     assert tally.interval == (run.rsr.low, run.rsr.high)

@@ -24,7 +24,7 @@ from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
 from lerobot_roborecover.analysis.resampling import masked_mean, resample
 from lerobot_roborecover.analysis.timing import budget_estimates, median_steps, rates_within
 from lerobot_roborecover.analysis.variance import variance_split
-from lerobot_roborecover.env.trial_log import TrialLogError
+from lerobot_roborecover.logs.trial_log import TrialLogError
 from lerobot_roborecover.scenario import Start
 from tests.support.bootstrap import bootstrap_interval
 from tests.support.trial_rows import policy_rows, trial_row

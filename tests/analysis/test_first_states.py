@@ -22,8 +22,8 @@ from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.evaluation.progress import RunProgress
 from lerobot_roborecover.scenario import Start
-from lerobot_roborecover.trials.progress import Tally
 from tests.support.trial_rows import trial_row, write_log
 
 STATES = 40
@@ -84,7 +84,7 @@ def test_every_table_has_the_initial_rate_of_first_states(tmp_path):
     assert "90 scenarios branch off from 40 first states" in format_table(summarise(rows))
     (board,) = make_leaderboard(tmp_path).boards
     assert {e.policy: e.initial for e in board.entries}["a"] == rate
-    tally = Tally("initial", {r["scenario_id"] for r in rows}, 1)
+    tally = RunProgress("initial", {r["scenario_id"] for r in rows}, 1)
     tally.add(rows)
     assert (tally.rate, tally.interval) == (rate.value, (rate.low, rate.high))
     shown = {c.title: v for c, v in zip(overall(results).columns, overall(results).rows[0], strict=True)}

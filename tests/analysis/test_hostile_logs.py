@@ -19,10 +19,10 @@ from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.env.trial_check import _CHECKS, FieldProblem, RowChecker, parse_json
-from lerobot_roborecover.env.trial_log import TrialLogError, read_log, read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow, make_row
-from lerobot_roborecover.trials.merge import merge
+from lerobot_roborecover.logs.merge import merge
+from lerobot_roborecover.logs.row import TrialRow, make_row
+from lerobot_roborecover.logs.schema import _CHECKS, FieldProblem, RowChecker, parse_json
+from lerobot_roborecover.logs.trial_log import TrialLogError, read_log, read_trial_log
 from tests.support.trial_rows import trial_row, write_log
 
 GOOD = asdict(trial_row(0))
@@ -136,7 +136,7 @@ def test_one_bad_log_does_not_take_a_leaderboard_down(tmp_path):
 
 
 def test_a_line_without_end_is_not_taken_into_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_roborecover.env.trial_log.MAX_LINE_BYTES", 2000)
+    monkeypatch.setattr("lerobot_roborecover.logs.trial_log.MAX_LINE_BYTES", 2000)
     path = tmp_path / "log.jsonl"
     path.write_text(line_of() + "x" * 5000)
     with pytest.raises(TrialLogError, match="line 2: longer than 2000 bytes"):
@@ -161,13 +161,13 @@ def test_options_that_only_look_alike_stay_apart(tmp_path):
 
 
 def test_what_an_error_message_holds_cannot_make_a_row_unreadable(tmp_path):
-    from lerobot_roborecover.env.trial_log import TrialLog
-    from lerobot_roborecover.env.trial_row import Protocol
+    from lerobot_roborecover.logs.row import EvalProtocol
+    from lerobot_roborecover.logs.trial_log import TrialLog
     from lerobot_roborecover.scenario import Outcome
     from tests.support.factories import fake_scenario
 
     row = make_row(
-        fake_scenario(0), Protocol("recovery", 0, "a\x07\udc80b", 1, None), dataset="/x\udc80",
+        fake_scenario(0), EvalProtocol("recovery", 0, "a\x07\udc80b", 1, None), dataset="/x\udc80",
         dataset_revision=None, trial=0, noise="per_trial", batch_size=1, outcome=Outcome.SIM_ERROR,
         reason="cannot open \udcff" + "x" * 200_000, steps=0, handoff=None, sim_s=0, policy_s=0,
         actions_sha256="",

@@ -8,7 +8,6 @@ import pytest
 
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.extent import missing
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.hub_results import find_entry, results_yaml
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
@@ -17,7 +16,8 @@ from lerobot_roborecover.analysis.report_tables import overall
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.trials.merge import merge
+from lerobot_roborecover.logs.extent import missing
+from lerobot_roborecover.logs.merge import merge
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 STATE = {"first_state": "a" * 64}

@@ -9,7 +9,7 @@ from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.power import (
-    Guess,
+    PowerAssumptions,
     detectable,
     guess_from,
     plans,
@@ -23,7 +23,10 @@ from lerobot_roborecover.cli.main import main
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 
-@pytest.mark.parametrize("guess", [Guess(0.5, 0.0, 0.0), Guess(0.3, 0.3, 0.7), Guess(0.5, 0.5, 0.5)])
+@pytest.mark.parametrize(
+    "guess",
+    [PowerAssumptions(0.5, 0.0, 0.0), PowerAssumptions(0.3, 0.3, 0.7), PowerAssumptions(0.5, 0.5, 0.5)],
+)
 @pytest.mark.parametrize(("trials", "difference", "family"), [(1, 0.2, 1), (5, 0.2, 15), (3, 0.12, 1)])
 def test_the_formula_agrees_with_the_exact_test(guess, trials, difference, family):
     n = scenarios_for(guess, difference, trials, family=family)
@@ -33,15 +36,15 @@ def test_the_formula_agrees_with_the_exact_test(guess, trials, difference, famil
 
 
 def test_between_policies_that_are_alike_the_made_up_test_keeps_its_size():
-    assert simulated_power(Guess(0.5, 0.3, 0.5), 0.0, 40, 3, samples=400) < 0.09
+    assert simulated_power(PowerAssumptions(0.5, 0.3, 0.5), 0.0, 40, 3, samples=400) < 0.09
 
 
 def test_more_of_anything_that_helps_helps():
-    guess = Guess(0.4, 0.25, 0.5)
+    guess = PowerAssumptions(0.4, 0.25, 0.5)
     assert scenarios_for(guess, 0.2, 5) < scenarios_for(guess, 0.2, 1) < scenarios_for(guess, 0.1, 1)
     assert scenarios_for(guess, 0.2, 1) < scenarios_for(guess, 0.2, 1, family=15)
     assert scenarios_for(guess, 0.2, 1) < scenarios_for(guess, 0.2, 1, 0.95)
-    assert scenarios_for(Guess(0.4, 0.25, 1.0), 0.2, 5) < scenarios_for(guess, 0.2, 5)
+    assert scenarios_for(PowerAssumptions(0.4, 0.25, 1.0), 0.2, 5) < scenarios_for(guess, 0.2, 5)
     assert detectable(guess, 200, 1) < detectable(guess, 60, 1)
     assert power(guess, detectable(guess, 60, 2), 60, 2) == pytest.approx(0.8, abs=1e-6)
     assert np.isnan(detectable(guess, 6, 1)), "six scenarios show nothing"
@@ -49,7 +52,7 @@ def test_more_of_anything_that_helps_helps():
 
 
 def test_made_up_rates_have_the_moments_that_were_asked_for():
-    guess = Guess(0.3, 0.25, 0.6)
+    guess = PowerAssumptions(0.3, 0.25, 0.6)
     a, b = true_rates(np.random.default_rng(0), guess, 0.2, (1, 100_000))
     assert a.mean() == pytest.approx(0.3, abs=0.01)
     assert b.mean() == pytest.approx(0.5, abs=0.01)
@@ -88,9 +91,9 @@ def test_a_pilot_gives_rate_scatter_and_correlation_and_never_the_difference(tmp
 
 def test_what_cannot_be_planned_is_refused(tmp_path):
     with pytest.raises(RowsError, match=r"--sd=60: .* cannot scatter by more than 50\.0 points"):
-        Guess(0.5, 0.6, 0.5)
+        PowerAssumptions(0.5, 0.6, 0.5)
     with pytest.raises(RowsError, match="must be above 0 and below 10 points"):
-        plans(Guess(0.9, 0.1, 0.5), [0.2], [1])
+        plans(PowerAssumptions(0.9, 0.1, 0.5), [0.2], [1])
     _, single = pilot(tmp_path, ("a", 0.5, 1), trials=1)
     with pytest.raises(RowsError, match="one trial a scenario"):
         guess_from(single)

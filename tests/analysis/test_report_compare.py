@@ -14,8 +14,8 @@ from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.results import Options
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.env.trial_log import TrialLogError
-from lerobot_roborecover.trials.merge import merge
+from lerobot_roborecover.logs.merge import merge
+from lerobot_roborecover.logs.trial_log import TrialLogError
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 QUICK = Options(draws=1000)

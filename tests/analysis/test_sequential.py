@@ -22,25 +22,26 @@ from lerobot_roborecover.analysis.logs import Study, read_study
 from lerobot_roborecover.analysis.panel import make_panel
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.sequential_pairs import watched_pair
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
-from lerobot_roborecover.analysis.sequential_record import read_record, record_path
 from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
-from lerobot_roborecover.analysis.watched import watched_pair
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.options import OptionError, RecoveryOptions
-from lerobot_roborecover.env.run import PlatformPart, open_run
-from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.options import RecoveryOptions
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
+from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkItem
+from lerobot_roborecover.logs.sequential_record import read_record, record_path
+from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Start
-from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.local import LocalEngine
-from lerobot_roborecover.trials.sequential import ALONE, open_watch
-from lerobot_roborecover.trials.units import OrderedQueue, Unit
 from lerobot_roborecover.workers.messages import SlotConfig
+from tests.evaluation.test_local_engine import PushHost
 from tests.support.factories import fake_dataset, fake_scenario
 from tests.support.trial_rows import policy_rows, write_log
-from tests.trials.test_local_engine import PushHost
 
 STEPS = st.lists(st.integers(-5, 5), min_size=1, max_size=40)
 
@@ -147,7 +148,7 @@ def test_trial_counts_decide_the_grid():
 
 
 def test_units_come_in_the_order_given():
-    units = [Unit(fake_scenario(n), k) for n in (2, 0, 1) for k in range(2)]
+    units = [WorkItem(fake_scenario(n), k) for n in (2, 0, 1) for k in range(2)]
     queue = OrderedQueue(units)
     assert [queue.take(units[-1]) for _ in range(2)] == units[:2]
     queue.put_back(units[1])
@@ -173,10 +174,10 @@ class LazyHost(PushHost):
 
 def evaluate(dataset, log, policy, host, against=""):
     """A run as `roborecover eval` makes it, without LeRobot."""
-    scenarios, run = open_run(
+    scenarios, run = create_session(
         RecoveryOptions(scenarios=str(dataset), trial_log=str(log)),
-        PlatformPart(SlotConfig("fake"), {}, None), workers=True,
-        facts=RunFacts(policy=policy, n_episodes=TRIALS),
+        SimulatorSpec(SlotConfig("fake"), {}, None), workers=True,
+        facts=PolicyMetadata(policy=policy, n_episodes=TRIALS),
     )  # fmt: skip
     run.pool.acquire()
     try:
@@ -239,9 +240,10 @@ def test_the_line_shows_what_holds_at_any_time(stopped, dataset, tmp_path):
 
 def test_a_scenario_counts_when_its_turn_has_come(dataset):
     """Whatever ends early would otherwise count first, and successes end early."""
-    scenarios, run = open_run(
+    scenarios, run = create_session(
         RecoveryOptions(scenarios=str(dataset), trial_log=str(dataset.parent / "turn.jsonl")),
-        PlatformPart(SlotConfig("fake"), {}, None), workers=True, facts=RunFacts(policy="a", n_episodes=1),
+        SimulatorSpec(SlotConfig("fake"), {}, None), workers=True,
+        facts=PolicyMetadata(policy="a", n_episodes=1),
     )  # fmt: skip
     watch = open_watch(ALONE, scenarios, run.protocol, 1, log=run.log.path, shard="")
     run.log.close()

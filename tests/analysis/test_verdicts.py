@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from lerobot_roborecover.analysis.compare import compare, to_screen
-from lerobot_roborecover.analysis.compared import compared
+from lerobot_roborecover.analysis.complete_subset import compared
 from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.figures import forest, paired_differences
 from lerobot_roborecover.analysis.figures_trials import oracle_bars

@@ -16,8 +16,8 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.errors import naming, os_error_line
-from lerobot_roborecover.journal import AppendOnly
-from lerobot_roborecover.whole import new_folder, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
+from lerobot_roborecover.utils.journal import AppendOnly
 from tests.support.trial_rows import policy_rows, write_log
 
 CONVERSION = Path(__file__).parents[2] / "conversion"
@@ -81,11 +81,11 @@ def test_an_error_of_ours_is_no_error_of_the_system(stands_in):
 
 
 def write_file(path):
-    write_whole(path, b"x" * 30_000)
+    atomic_write(path, b"x" * 30_000)
 
 
 def write_folder(path):
-    with new_folder(path) as folder:
+    with atomic_dir(path) as folder:
         folder.mkdir()
         (folder / "big").write_bytes(b"x" * 30_000)
 
@@ -94,7 +94,7 @@ def write_arrow(path):
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with new_folder(path) as folder:
+    with atomic_dir(path) as folder:
         folder.mkdir()
         pq.write_table(pa.table({"x": [os.urandom(100) for _ in range(900)]}), folder / "x.parquet")
 

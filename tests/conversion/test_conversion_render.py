@@ -14,7 +14,7 @@ from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.render import check_rendering, render_dataset
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 from tests.support.conversion_scripts import script

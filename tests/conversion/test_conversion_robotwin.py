@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Reset, Task
 from tests.support.conversion_scripts import script
 from tests.support.release_files import robotwin_record, write_release

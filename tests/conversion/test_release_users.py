@@ -14,8 +14,8 @@ import pytest
 
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.release.convert import read_release
-from lerobot_roborecover.datasets.release.earlier import compare_with_earlier, read_converted, read_earlier
 from lerobot_roborecover.datasets.release.fixtures import check_fixtures, released_fixtures
+from lerobot_roborecover.datasets.release.previous import compare_with_earlier, read_converted, read_earlier
 from lerobot_roborecover.datasets.release.record import Reading
 from lerobot_roborecover.platforms.libero.catalog import libero_tasks
 from lerobot_roborecover.scenario import Pose, Reset, ScenarioError, Task

@@ -18,9 +18,9 @@ from lerobot_roborecover.curation.agreement import (
     step_agreement,
 )
 from lerobot_roborecover.curation.annotation.discussion import read_discussion
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, votes_folder
-from lerobot_roborecover.curation.attrition import count_stages, read_decisions
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.funnel import count_stages, read_decisions
 from lerobot_roborecover.curation.resolution import (
     ResolutionConfig,
     resolve,
@@ -30,7 +30,7 @@ from lerobot_roborecover.curation.resolution import (
 )
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.candidate_files import candidate_dataset
 
@@ -159,7 +159,7 @@ def annotated(tmp_path):
         "ep-0004": [{"step": 12, "stage": "Contact"}] * 3,
     }
     for who, name in enumerate(("ann", "bob", "cleo")):
-        book = VoteBook(votes_folder(root, None), name, 1)
+        book = VoteJournal(votes_folder(root, None), name, 1)
         for candidate, votes in given.items():
             if who < len(votes):
                 book.add(replace(vote(candidate, **votes[who]), uid=f"{name}-{candidate}"))
@@ -231,7 +231,7 @@ def test_a_discussion_settles_what_the_first_round_did_not(annotated, tmp_path):
     for number, name in enumerate(("ann", "bob", "cleo")):
         before = resolve(candidates, folder, config)
         assert before.counts()["no consensus"] == 1, f"{number} of 3 have voted again"
-        book = VoteBook(folder, name, 2)
+        book = VoteJournal(folder, name, 2)
         book.add(Vote("again-" + name, "ep-0002", "recovery", 20, "Place", "Wrong Pose"))
         book.close()
     after = resolve(candidates, folder, config)

@@ -10,16 +10,21 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.annotation import automatic
-from lerobot_roborecover.curation.annotation.annotators import EYES, label_kind
+from lerobot_roborecover.curation.annotation.annotators import LABELERS, label_kind
 from lerobot_roborecover.curation.annotation.automatic import annotate, as_printed, reading, sheet_of
 from lerobot_roborecover.curation.annotation.discussion import Discussion
+from lerobot_roborecover.curation.annotation.features import (
+    LOOK_S,
+    EpisodeFeatures,
+    EpisodeInfo,
+    frames_to_look_at,
+)
 from lerobot_roborecover.curation.annotation.frames import Videos
-from lerobot_roborecover.curation.annotation.looking import LOOK_S, Look, Sheet, frames_to_look_at
 from lerobot_roborecover.curation.annotation.rules import Verdict, judge
 from lerobot_roborecover.curation.annotation.shown import shown
-from lerobot_roborecover.curation.annotation.votes import VoteBook, ballot, read_votes, votes_folder
+from lerobot_roborecover.curation.annotation.votes import VoteJournal, ballot, read_votes, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
-from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.resolution import ResolutionConfig, decisions_of, resolve, scenarios_of
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
@@ -35,7 +40,9 @@ def ramp(*points: tuple[int, float]) -> np.ndarray:
     return np.interp(T, *zip(*points, strict=True))
 
 
-def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **objects: dict) -> Look:
+def seen(
+    eye: str, closed=None, human: bool = False, solved: bool = False, **objects: dict
+) -> EpisodeFeatures:
     """What an annotator sees of a rollout: `reach`, `goal`, `moved`, `height` of each object."""
     closed = np.ones(LAST + 1) if closed is None else closed
     whole = {
@@ -44,8 +51,8 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
     }
     first = next(iter(whole.values()))
     speed = (np.abs(np.gradient(first["reach"])) + np.abs(np.gradient(first["moved"]))) * FPS
-    look = Look(Sheet("it", "do it", LAST, FPS, solved, human))
-    for f in frames_to_look_at(EYES[eye].first_look, FPS, LAST):
+    look = EpisodeFeatures(EpisodeInfo("it", "do it", LAST, FPS, solved, human))
+    for f in frames_to_look_at(LABELERS[eye].first_look, FPS, LAST):
         look.readings[f] = {
             "hand": {"speed": float(speed[f]), "a3": float(closed[f])},
             **{n: {k: float(v[f]) for k, v in values.items()} for n, values in whole.items()},
@@ -54,21 +61,21 @@ def seen(eye: str, closed=None, human: bool = False, solved: bool = False, **obj
 
 
 @pytest.mark.parametrize("fps", [10, 20, 80, 400])
-@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("eye", LABELERS)
 def test_looks_follow_the_clock_and_not_the_frames(fps, eye):
-    frames = frames_to_look_at(EYES[eye].first_look, fps, 10 * fps)
+    frames = frames_to_look_at(LABELERS[eye].first_look, fps, 10 * fps)
     (step,) = set(np.diff(frames[:-1]).tolist())
     assert step / fps == pytest.approx(LOOK_S, abs=0.5 / fps + 1e-9)
     assert frames[0] < max(step, 2)
     assert frames[-1] == 10 * fps
-    assert frames_to_look_at(EYES[eye].first_look, fps, 0) == [0]
-    assert frames_to_look_at(EYES[eye].first_look, 1, 2)[-3:] in ([0, 1, 2], [1, 2])
+    assert frames_to_look_at(LABELERS[eye].first_look, fps, 0) == [0]
+    assert frames_to_look_at(LABELERS[eye].first_look, 1, 2)[-3:] in ([0, 1, 2], [1, 2])
 
 
 def test_where_no_goal_is_shown_the_object_is_the_one_that_ends_farthest_from_its_place():
     still = {"reach": ramp((0, 0.3), (50, 0.25))}
     pushed = {"reach": ramp((0, 0.4), (50, 0.02), (100, 0.3)), "moved": ramp((50, 0.0), (60, 0.06))}
-    found = judge(seen("auto-1", first=still, second=pushed), EYES["auto-1"])
+    found = judge(seen("auto-1", first=still, second=pushed), LABELERS["auto-1"])
     assert (found.deviation, found.step is not None and 60 <= found.step <= 90) == (
         DeviationType.SCENE_CHANGE,
         True,
@@ -118,32 +125,32 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("eye", LABELERS)
 @pytest.mark.parametrize("case", CASES)
 def test_each_deviation_has_its_label_at_its_step(case, eye):
     thing, closed, step, stage, deviation = CASES[case]
-    found = judge(seen(eye, closed, thing=thing), EYES[eye])
+    found = judge(seen(eye, closed, thing=thing), LABELERS[eye])
     assert (found.stage, found.deviation, found.discard) == (stage, deviation, "")
     # Looks are ten frames apart, rest takes 12 frames, and the last 2 or 3 cm are no progress.
     assert step - 10 <= found.step <= step + 22
 
 
-@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("eye", LABELERS)
 def test_other_parts_and_what_the_object_is_brought_to(eye):
     still = {"reach": ramp((0, 0.4), (60, 0.3)), "goal": np.full(LAST + 1, 0.3)}
     button = {"reach": ramp((0, 0.4), (60, 0.02)), "moved": ramp((60, 0.0), (66, 0.03))}
-    found = judge(seen(eye, cup=still, button=button), EYES[eye])
+    found = judge(seen(eye, cup=still, button=button), LABELERS[eye])
     assert (found.stage, found.deviation) == (Stage.APPROACH, DeviationType.WRONG_TARGET)
     stick = carried(100, 0.18)
     bottle = {"reach": np.full(LAST + 1, 0.3), "moved": ramp((95, 0.0), (105, 0.07))}
-    found = judge(seen(eye, stick=stick, bottle=bottle), EYES[eye])
+    found = judge(seen(eye, stick=stick, bottle=bottle), LABELERS[eye])
     assert (found.stage, found.deviation) == (Stage.PLACE, DeviationType.SCENE_CHANGE)
 
 
-@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("eye", LABELERS)
 def test_discards(eye):
     def verdict(thing, **sheet) -> str:
-        return judge(seen(eye, thing=thing, **sheet), EYES[eye]).discard
+        return judge(seen(eye, thing=thing, **sheet), LABELERS[eye]).discard
 
     assert verdict(carried(100, 0.0), solved=True) == "temporary"
     fallen = carried(100, 0.18, LOST, height=ramp((120, 0.0), (130, -0.5)))
@@ -155,7 +162,7 @@ def test_discards(eye):
     assert verdict(stopped) == "temporary"
 
 
-@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("eye", LABELERS)
 def test_a_person_marks_by_stopping(eye):
     dropped = {
         "reach": ramp((0, 0.3), (35, 0.02), (70, 0.02), (85, 0.15), (145, 0.15), (160, 0.02)),
@@ -163,10 +170,10 @@ def test_a_person_marks_by_stopping(eye):
         "moved": ramp((40, 0.0), (70, 0.08), (160, 0.08), (195, 0.3)),
     }
     closed = ramp((0, 1.0), (70, 1.0), (71, -1.0), (149, -1.0), (150, 1.0))
-    found = judge(seen(eye, closed, human=True, solved=True, thing=dropped), EYES[eye])
+    found = judge(seen(eye, closed, human=True, solved=True, thing=dropped), LABELERS[eye])
     assert (found.stage, found.deviation) == (Stage.APPROACH, DeviationType.STAGE_ROLLBACK)
     assert 85 <= found.step <= 100
-    assert judge(seen(eye, human=True, solved=True, thing=carried(100, 0.0)), EYES[eye]) != Verdict(
+    assert judge(seen(eye, human=True, solved=True, thing=carried(100, 0.0)), LABELERS[eye]) != Verdict(
         discard="temporary"
     )
 
@@ -219,16 +226,16 @@ def test_three_programs_vote_on_recorded_steps(tmp_path, capsys):
     root = candidate_dataset(tmp_path / "rollouts", 25, dropped=(7,))
     assert main(["annotate", str(root), "--automatic"]) == 0
     said = capsys.readouterr().out.splitlines()
-    for name in EYES:
+    for name in LABELERS:
         mine = [line.removeprefix(f"{name}: ") for line in said if line.startswith(name)]
         assert [line.split(",")[0] for line in mine[:2]] == ["20 of 24", "24 of 24"]
         assert len(mine) == 3
     assert main(["annotate", str(root), "--automatic"]) == 0
-    assert capsys.readouterr().out.splitlines() == [f"{name}: nothing to do" for name in EYES]
+    assert capsys.readouterr().out.splitlines() == [f"{name}: nothing to do" for name in LABELERS]
     folder = votes_folder(root, None)
     records, candidates = read_votes(folder), read_candidates(root)
-    assert set(records) == set(EYES)
-    for name in EYES:
+    assert set(records) == set(LABELERS)
+    for name in LABELERS:
         given = ballot(records[name], 1).votes
         assert set(given) == set(candidates.by_id) - {"ep-0007"}
         assert all((v.annotator, v.informed, v.comment) == (name, False, "") for v in given.values())
@@ -252,7 +259,7 @@ def test_a_platform_says_which_command_closes_its_grippers(tmp_path, monkeypatch
         automatic, "verdict_on", lambda sheet, *_: sheets.append(sheet) or Verdict(discard="temporary")
     )
     annotate(candidate_dataset(tmp_path / "rollouts", 1), print)
-    assert [sheet.gripper_commands for sheet in sheets] == [(0.0, 0.7)] * len(EYES)
+    assert [sheet.gripper_commands for sheet in sheets] == [(0.0, 0.7)] * len(LABELERS)
 
 
 def test_programs_need_no_video(tmp_path):
@@ -285,14 +292,14 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, monkeypatch, capsys):
     assert "auto-1: 3 of 3" in capsys.readouterr().out
     then = read_votes(folder)
     assert then["auto-1"][:2] == first["auto-1"]
-    assert all([r["candidate"] for r in then[n]] == [f"ep-{i:04d}" for i in range(5)] for n in EYES)
+    assert all([r["candidate"] for r in then[n]] == [f"ep-{i:04d}" for i in range(5)] for n in LABELERS)
 
 
 def test_a_build_has_them_vote_into_its_own_folder(tmp_path):
     root, said = candidate_dataset(tmp_path / "rollouts", 1), []
-    Work().annotate(root, tmp_path / "votes", said.append)
-    assert set(read_votes(tmp_path / "votes")) == set(EYES)
-    assert len(said) == 2 * len(EYES)
+    StageRunners().annotate(root, tmp_path / "votes", said.append)
+    assert set(read_votes(tmp_path / "votes")) == set(LABELERS)
+    assert len(said) == 2 * len(LABELERS)
     assert not votes_folder(root, None).exists()
 
 
@@ -320,7 +327,7 @@ def test_what_cannot_be_voted_on_is_refused(tmp_path, monkeypatch):
     Discussion(2, {"ep-0001": {"why": "stage", "votes": []}}).write(listed)
     with pytest.raises(ScenarioError, match="lists 'ep-0001', which is not in"):
         annotate(root, print, only=listed)
-    book = VoteBook(votes_folder(root, None), "auto-1", 1)
+    book = VoteJournal(votes_folder(root, None), "auto-1", 1)
     with pytest.raises(ScenarioError, match="in use by another process"):
         annotate(root, print)
     book.close()

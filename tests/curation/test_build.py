@@ -13,20 +13,20 @@ import yaml
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
 from lerobot_roborecover.curation.annotation.votes import Vote
-from lerobot_roborecover.curation.attrition import Decision, StageCounts, record_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.collection import Collected
+from lerobot_roborecover.curation.funnel import Decision, StageCounts, record_decisions
 from lerobot_roborecover.curation.pipeline.config import CollectPart, ScreenPart, ValidatePart, read_config
 from lerobot_roborecover.curation.pipeline.requests import collect_options
-from lerobot_roborecover.curation.pipeline.stages import Chain, Waiting, _key, _options
+from lerobot_roborecover.curation.pipeline.stages import AwaitingAnnotations, Pipeline, _key, _options
 from lerobot_roborecover.curation.pipeline.summary import markdown
-from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.split import SplitConfig
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.datasets.video_frames import check_frames
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.journal import Journal
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.journal import Journal
 
 EXAMPLE = Path(__file__).parents[2] / "policies" / "build" / "metaworld.yaml"
 FAKE = {
@@ -110,7 +110,7 @@ def test_the_example_can_be_read_and_tried(tmp_path, monkeypatch, capsys):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(OptionError, match=words):
             read_config(tmp_path / "bad.yaml")
-    chain = Chain(config, Work())
+    chain = Pipeline(config, StageRunners())
     with pytest.raises(OptionError, match="--from nowhere: not one of"):
         chain.build("nowhere")
     with pytest.raises(OptionError, match="come in the order"):
@@ -154,8 +154,8 @@ def stand_in(tmp_path, monkeypatch):
     def build(*args, content=content, **kwargs) -> list[str]:
         asked.clear()
         config = read_config(write(tmp_path / "build.yaml", content))
-        work = Work(**{f.name: stand_in(f.name) for f in fields(Work)})
-        Chain(config, work, lambda line: None).build(*args, **kwargs)
+        work = StageRunners(**{f.name: stand_in(f.name) for f in fields(StageRunners)})
+        Pipeline(config, work, lambda line: None).build(*args, **kwargs)
         return list(asked)
 
     build.root, build.content, build.asked = tmp_path / "out", content, asked
@@ -170,9 +170,9 @@ def test_a_place_is_no_part_of_what_a_stage_makes(part):
 
 def test_what_runs_again(stand_in):
     build = stand_in
-    with pytest.raises(Waiting, match=r"3 candidates wait for votes \(3 each\)"):
+    with pytest.raises(AwaitingAnnotations, match=r"3 candidates wait for votes \(3 each\)"):
         build()
-    with pytest.raises(Waiting):
+    with pytest.raises(AwaitingAnnotations):
         build()
     assert not (build.root / "old").exists(), "what is unchanged is left alone while people are waited for"
     assert vote_for_all(build.root) == 3
@@ -228,7 +228,7 @@ def test_what_runs_again(stand_in):
 
 def test_a_stage_that_ends_in_an_error_is_not_recorded(stand_in):
     build = stand_in
-    with pytest.raises(Waiting):
+    with pytest.raises(AwaitingAnnotations):
         build()
     vote_for_all(build.root)
     build.broken = {"agree"}
@@ -247,14 +247,14 @@ def test_rollouts_of_which_nothing_is_kept_do_not_end_a_build(stand_in, monkeypa
     build = stand_in
     content = changed(build.content, "collect.none", {"expert": "expert_biased", "draw": 1})
     build.empty = {"collect"}
-    with pytest.raises(Waiting, match="3 candidates wait"):
+    with pytest.raises(AwaitingAnnotations, match="3 candidates wait"):
         build(content=content)
     options = build.asked["collect"][0]
     assert options.out == build.root / "collect" / "none"
     nothing = Collected(None, (), 0)
     monkeypatch.setattr("lerobot_roborecover.curation.collect.collection.collect", lambda *_: nothing)
     lines: list[str] = []
-    Work().collect(options, lines.append)
+    StageRunners().collect(options, lines.append)
     assert "no rollout was kept" in lines[0]
 
 
@@ -290,7 +290,7 @@ def test_a_build_of_an_earlier_version_is_up_to_date(tmp_path):
     }  # fmt: skip
     config = read_config(write(tmp_path / "build.yaml", content))
     found, key = {}, ""
-    for stage in Chain(config, Work())._stages():
+    for stage in Pipeline(config, StageRunners())._stages():
         key = _key(key, stage)
         found[stage.label] = key[:16]
     assert found == KEYS
@@ -322,7 +322,7 @@ def build(tmp_path, monkeypatch):
 
     loads = []
     monkeypatch.setattr(
-        "lerobot_roborecover.trials.load.load_host", lambda c: loads.append(c) or load_push_host(c)
+        "lerobot_roborecover.evaluation.loading.load_host", lambda c: loads.append(c) or load_push_host(c)
     )
     policies = [{"path": str(p), "name": p.name} for p in push_checkpoints(tmp_path / "policies")[:2]]
     whole = {**FAKE, "out": str(tmp_path / "out"), "screen": {**FAKE["screen"], "policies": policies}}

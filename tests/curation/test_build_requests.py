@@ -12,7 +12,7 @@ from lerobot_roborecover.cli import agree, collect, publish, render, screen, spl
 from lerobot_roborecover.cli.main import build_parser
 from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
-from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from tests.curation.test_build import write
 
 pytestmark = pytest.mark.lerobot
@@ -118,9 +118,9 @@ def same(mine, command) -> None:
     assert plain(asdict(mine)) == plain(asdict(command))
 
 
-def one(content: dict, tmp_path: Path) -> tuple[ChainConfig, Places]:
+def one(content: dict, tmp_path: Path) -> tuple[ChainConfig, BuildPaths]:
     config = read_config(write(tmp_path / "build.yaml", content))
-    return config, Places(config)
+    return config, BuildPaths(config)
 
 
 @pytest.mark.parametrize(("name", "content"), [("least", LEAST), ("most", MOST)])

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.curation.annotation.frames import Videos
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, read_votes
-from lerobot_roborecover.curation.attrition import (
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, read_votes
+from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
+from lerobot_roborecover.curation.funnel import (
     Decision,
     attrition_table,
     count_stages,
     read_decisions,
     record_decisions,
 )
-from lerobot_roborecover.curation.candidates import read_candidates
-from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
 from lerobot_roborecover.curation.resolution import queued
 from lerobot_roborecover.datasets.contents import list_files
 from lerobot_roborecover.datasets.schema import FOLDER
@@ -97,7 +97,7 @@ def test_joined_datasets_bring_their_votes_and_pictures(parts, tmp_path):
     sources = [shutil.copytree(parts / name, tmp_path / name) for name in ("part-0", "part-1")]
     marked = Vote("", "", "recovery", 7, "Move", "Wrong Pose")
     for number, root in enumerate(sources):
-        book = VoteBook(root / FOLDER / "votes", "ann", 1)
+        book = VoteJournal(root / FOLDER / "votes", "ann", 1)
         book.add(replace(marked, uid=f"vote-{number}-of-ann", candidate=f"ep-000{2 * number}"))
         book.close()
     (sources[1] / FOLDER / "examples").mkdir()

@@ -16,8 +16,8 @@ import pytest
 from lerobot_roborecover.cli.main import build_parser, main
 from lerobot_roborecover.curation.pipeline.check import check_build
 from lerobot_roborecover.curation.pipeline.config import read_config
-from lerobot_roborecover.curation.pipeline.stages import Chain, Pace, Waiting
-from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.pipeline.stages import AwaitingAnnotations, BuildEta, Pipeline
+from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.render import RenderRequest, render
 from lerobot_roborecover.curation.screen.dataset import validate_next
 from lerobot_roborecover.curation.validate.dataset import reject_next
@@ -25,10 +25,10 @@ from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.episodes import write_episodes
 from lerobot_roborecover.datasets.video_frames import check_frames
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.words import counted, lasting, next_line
+from lerobot_roborecover.utils.text import format_duration, next_command, pluralize
 from tests.curation.test_build import FAKE, changed, write
 from tests.support.candidate_files import candidate_dataset
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
@@ -149,7 +149,7 @@ def test_the_command_runs_nothing_where_something_stands_against_it(problems, tm
 
 
 def test_how_far_a_build_is():
-    pace = Pace(["collect a", "join", "split"], {"join": 61.0})
+    pace = BuildEta(["collect a", "join", "split"], {"join": 61.0})
     assert re.fullmatch(
         r"\[stage 2 of 3, 0:00:0\d elapsed, left at most: about 0:01:01 and 1 stage never timed\]",
         pace.at("join"),
@@ -170,7 +170,7 @@ def test_every_next_line_is_accepted_by_the_parser_of_its_command(tmp_path, monk
     """Folders with blanks and quotes in their names included."""
     out = tmp_path / "my 'set'"
     bare = write_scenarios(out / "bare", [fake_scenario(0)])
-    assert accepted(next_line(validate_next(bare, out / "trials")))[-4:] == [
+    assert accepted(next_command(validate_next(bare, out / "trials")))[-4:] == [
         "--candidates", "CANDIDATES", "--out", "VALIDATED",
     ]  # fmt: skip
     request = ValidationRequest(
@@ -203,9 +203,9 @@ def test_a_build_that_waits_names_a_command_that_is_accepted(tmp_path, monkeypat
         "screen": {"policies": [{"path": "p"}]}, "split": {"sizes": {"train": 0.5, "test": 0.5}},
     }  # fmt: skip
     lines: list[str] = []
-    work = Work()
-    chain = Chain(read_config(write(tmp_path / "b.yaml", content)), work, lines.append)
-    with pytest.raises(Waiting, match="1 candidate waits for votes") as caught:
+    work = StageRunners()
+    chain = Pipeline(read_config(write(tmp_path / "b.yaml", content)), work, lines.append)
+    with pytest.raises(AwaitingAnnotations, match="1 candidate waits for votes") as caught:
         chain.build()
     assert accepted(str(caught.value).splitlines()[-1])[0] == "annotate"
     assert "1 candidate of 1 dataset in" in "\n".join(lines)
@@ -226,9 +226,9 @@ def test_scripted_drivers_are_listed_without_an_out(capsys):
 
 
 def test_numbers_of_things():
-    assert [counted(n, "candidate") for n in (0, 1, 2)] == ["0 candidates", "1 candidate", "2 candidates"]
-    assert counted(4, "screening policy") == "4 screening policies"
-    assert lasting(3725.4) == "1:02:05"
+    assert [pluralize(n, "candidate") for n in (0, 1, 2)] == ["0 candidates", "1 candidate", "2 candidates"]
+    assert pluralize(4, "screening policy") == "4 screening policies"
+    assert format_duration(3725.4) == "1:02:05"
 
 
 @pytest.mark.lerobot
@@ -236,7 +236,7 @@ def test_numbers_of_things():
 def test_rendering_ends_in_a_lerobot_dataset_that_knows_what_was_decided(tmp_path, capsys):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
+    from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
 
     scenarios = [fake_scenario(i, steps=5 + i) for i in range(2)]
     source = write_scenarios(tmp_path / "set", scenarios, description="two", license="mit")

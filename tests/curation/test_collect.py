@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.curation.collect.judge import (
-    Judging,
+    FilterConfig,
     verdict,
 )
 from lerobot_roborecover.curation.collect.record import (
     read_record,
     record_path,
 )
-from lerobot_roborecover.curation.collect.rollouts import Ended, RolloutBook, run_expert
+from lerobot_roborecover.curation.collect.rollouts import RolloutJournal, RolloutOutcome, run_expert
 from lerobot_roborecover.curation.collect.server import SERVER, CollectServer, FilmJob
 from lerobot_roborecover.curation.collect.starts import make_units, parse_numbers
 from lerobot_roborecover.platforms import make_simulator
@@ -25,10 +25,10 @@ from lerobot_roborecover.platforms.fake import PLATFORM as FAKE
 from lerobot_roborecover.platforms.limits import limits_of
 from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.platforms.starts import Starts, stream
-from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE
+from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task
-from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.workers.messages import More, SlotConfig
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.workers.messages import InProgress, SlotConfig
 from lerobot_roborecover.workers.slots import SlotPool
 from tests.support.processes import PATIENCE_S
 
@@ -51,7 +51,7 @@ def config(seed=5):
 def ask(server, command, argument):
     """A command to its end, as the dispatcher gives it."""
     reply = server.answer(command, argument)
-    while isinstance(reply, More):
+    while isinstance(reply, InProgress):
         reply = server.answer(command)
     return reply
 
@@ -59,7 +59,7 @@ def ask(server, command, argument):
 def drive(server, folder, planned):
     """A rollout to its end, its record kept as the book does."""
     ended = ask(server, "drive", planned)
-    write_whole(record_path(folder, planned.record_name), ended.record)
+    atomic_write(record_path(folder, planned.record_name), ended.record)
     return ended
 
 
@@ -248,7 +248,7 @@ def test_damaged_records_say_so(tmp_path):
 
 def roll(work, made, slots, stop_after=None):
     """Rolls out in worker processes; as collect does, but for LeRobot."""
-    book = RolloutBook(work)
+    book = RolloutJournal(work)
     ended = []
 
     def on_end(end, record):
@@ -281,13 +281,13 @@ def test_a_breaking_simulator_costs_its_rollout_alone(tmp_path):
     made = [*units((0,), tasks=("faults/raises", "faults/exits"), horizon=30), *units((0,))]
     ended = roll(tmp_path, made, 1)
     assert len(ended) == len(made)
-    book = RolloutBook(tmp_path)
+    book = RolloutJournal(tmp_path)
     try:
         outcomes = {u.task.name: book.find(u.id).outcome for u in made}
         assert outcomes["raises"] == outcomes["exits"] == "sim_error"
         assert outcomes["push-left"] in ("success", "horizon")
         broken = next(u for u in made if u.task.name == "raises")
-        found = verdict(broken, book.find(broken.id), book, Judging())
+        found = verdict(broken, book.find(broken.id), book, FilterConfig())
         assert found.dropped.reason == "not run to its end: sim_error"
         assert "on purpose" in found.dropped.detail
         assert book.find(broken.id, retry_errors=True) is None
@@ -299,11 +299,11 @@ def test_a_breaking_simulator_costs_its_rollout_alone(tmp_path):
 
 
 def test_the_journal_is_one_process_own(tmp_path):
-    book = RolloutBook(tmp_path)
+    book = RolloutJournal(tmp_path)
     with pytest.raises(ScenarioError, match="another process"):
-        RolloutBook(tmp_path)
-    book.add(Ended("a", "success", 3), b"")
+        RolloutJournal(tmp_path)
+    book.add(RolloutOutcome("a", "success", 3), b"")
     book.close()
     (tmp_path / "rollouts.jsonl").open("a").write('{"schema": 1, "rollout": "b", "outcome": "won"}\n')
     with pytest.raises(ScenarioError, match="not a rollout's end"):
-        RolloutBook(tmp_path)
+        RolloutJournal(tmp_path)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.attrition import count_stages, read_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.record import read_record
+from lerobot_roborecover.curation.funnel import count_stages, read_decisions
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.libero import goals
-from lerobot_roborecover.recording import PERTURBED, UNREACHABLE
+from lerobot_roborecover.replay.recorder import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task
 from tests.support.factories import save_policy
 
@@ -248,7 +248,7 @@ def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, c
 def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_path, monkeypatch):
     """As where a cluster's machine with the policy is lost for good."""
     from lerobot_roborecover.curation.collect.rollouts import run_policy
-    from lerobot_roborecover.trials.engine import Engine
+    from lerobot_roborecover.evaluation.scheduler import Engine
 
     class Away:
         unrun: ClassVar = {("toy-p-s0", 0): "nobody answers"}
@@ -257,7 +257,7 @@ def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_pa
         def run(self, units):
             assert [u.scenario.seed for u in units] == [0]
 
-    monkeypatch.setattr("lerobot_roborecover.trials.places.open_engine", lambda *_: Away())
+    monkeypatch.setattr("lerobot_roborecover.evaluation.launch.open_engine", lambda *_: Away())
     planned = SimpleNamespace(seed=0, trial=0, driver="p")
     with pytest.raises(ScenarioError, match=r"1 trial could not be run.*nobody answers.*command again"):
         run_policy([[planned]], None, None, None, 7, lambda ended, record: None)

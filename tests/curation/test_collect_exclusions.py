@@ -15,7 +15,7 @@ from lerobot_roborecover.curation.collect.record import (
     RecorderSettings,
 )
 from lerobot_roborecover.platforms.limits import Workspace
-from lerobot_roborecover.recording import PERTURBED, Steps
+from lerobot_roborecover.replay.recorder import PERTURBED, Steps
 from lerobot_roborecover.scenario import Reset, ScenarioError
 
 

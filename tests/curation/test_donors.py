@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.curation.attrition import StageCounts
 from lerobot_roborecover.curation.donors import (
     DonorOptions,
     add_step,
@@ -21,12 +20,12 @@ from lerobot_roborecover.curation.donors import (
     judge,
     write_donors,
 )
+from lerobot_roborecover.curation.funnel import StageCounts
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, read_trials
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.trial import actions_digest
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_scenario, save_policy
 from tests.support.loop import push_policy

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, votes_folder
-from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.people import INSPECTION, anonymise, find_people
 from lerobot_roborecover.curation.resolution import ResolutionConfig, resolve, write_resolution
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
@@ -26,7 +26,7 @@ SECRETS = (*NAMES, "my boss says", "too fast for me")
 
 def vote_on(root, step=20):
     for n, name in enumerate(NAMES):
-        book = VoteBook(votes_folder(root, None), name, 1)
+        book = VoteJournal(votes_folder(root, None), name, 1)
         for i in range(3):
             comment = "my boss says so" if n == 0 else ""
             book.add(
@@ -41,7 +41,7 @@ def annotated(tmp_path):
     """Candidates with three people's votes and a program's, and the scenarios they resolve to."""
     root = candidate_dataset(tmp_path / "candidates", 5)
     vote_on(root)
-    book = VoteBook(votes_folder(root, None), "auto-1", 1)
+    book = VoteJournal(votes_folder(root, None), "auto-1", 1)
     book.add(
         Vote("uid-auto-0001", "ep-0000", "recovery", 20, "Move", "Wrong Pose", comment="rule 3", seconds=1.0)
     )
@@ -140,7 +140,7 @@ def test_a_name_that_stays_is_said_and_a_pseudonym_is_not_taken_twice(annotated,
     (root / "README.md").write_text("With thanks to alice and to malice.")
     assert anonymise(root, tmp_path / "one", find_people(root)) == ["README.md"]
     votes = votes_folder(root, None)
-    VoteBook(votes, "annotator-2", 1).close()
+    VoteJournal(votes, "annotator-2", 1).close()
     (votes / "annotator-2.jsonl").write_bytes((votes / "alice.jsonl").read_bytes())
     (votes / "alice.jsonl").unlink()
     (votes / "carol.jsonl").unlink()

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.curation.attrition import read_decisions
-from lerobot_roborecover.curation.collect.rollouts import RolloutBook
+from lerobot_roborecover.curation.collect.rollouts import RolloutJournal
+from lerobot_roborecover.curation.funnel import read_decisions
 from lerobot_roborecover.curation.policy_trials import read_trials
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frames import last_frames
@@ -86,7 +86,7 @@ def journal(path: Path) -> list[str]:
 def test_an_experts_rollouts(cluster, run, monkeypatch, tmp_path):
     asked = ["--expert=expert_biased", "--seeds=0-7", "--perturb", "--frames=32", f"--env.{SLOW}"]
     assert run(*arguments(tmp_path / "here", *asked)) == 0
-    with node_dies(cluster, monkeypatch, RolloutBook, "add", after=4):
+    with node_dies(cluster, monkeypatch, RolloutJournal, "add", after=4):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=0")) == 0
     assert meaning(tmp_path / "ray") == meaning(tmp_path / "here")
     files = [journal(tmp_path / f"{name}.work" / "rollouts.jsonl") for name in ("here", "ray")]
@@ -116,7 +116,7 @@ def test_a_policys_rollouts(cluster, run, monkeypatch, tmp_path):
     ]
     asked += [f"--env.{SLOW}", "--perturb", "--scene-touched=1"]
     assert run(*arguments(tmp_path / "here", *asked)) in (0, 1)
-    with node_dies(cluster, monkeypatch, RolloutBook, "add", after=3):
+    with node_dies(cluster, monkeypatch, RolloutJournal, "add", after=3):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=3")) in (0, 1)
     books = [tmp_path / f"{name}.work" for name in ("here", "ray")]
     here, ray = (journal(book / "rollouts.jsonl") for book in books)
@@ -217,7 +217,7 @@ def test_what_was_begun_here_goes_on_there(cluster, run, monkeypatch, tmp_path):
     """How fast is no part of what a collection is."""
     cluster.complete()
     asked = ["--expert=expert_biased", "--seeds=0-3", "--frames=none"]
-    original, ended = RolloutBook.add, []
+    original, ended = RolloutJournal.add, []
 
     def stops(book, *args):
         original(book, *args)
@@ -226,7 +226,7 @@ def test_what_was_begun_here_goes_on_there(cluster, run, monkeypatch, tmp_path):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(RolloutBook, "add", stops)
+        patch.setattr(RolloutJournal, "add", stops)
         assert run(*arguments(tmp_path / "one", *asked)) == 130
     assert run(*arguments(tmp_path / "one", *asked, "--engine=ray", "--slots=2")) == 0
     assert len(journal(tmp_path / "one.work" / "rollouts.jsonl")) == 8

@@ -14,13 +14,13 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, ballot, read_votes
-from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, ballot, read_votes
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.repair import repair_dataset
 from lerobot_roborecover.datasets.schema import FOLDER
-from lerobot_roborecover.journal import Journal
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.journal import Journal
 from tests.support.candidate_files import candidate_dataset
 from tests.support.release_files import files_of
 
@@ -161,7 +161,7 @@ def test_what_would_be_lost_or_cannot_be_ordered_is_refused_by_name(source, tmp_
     root = edited(source, tmp_path / "busy", [2, 3])
     repair_dataset(root, [str(source)])
     cast(source_copy := Path(shutil.copytree(source, tmp_path / "copy")), "ann", vote("ann", 2, 19))
-    book = VoteBook(root / FOLDER / "votes", "ann", 1)
+    book = VoteJournal(root / FOLDER / "votes", "ann", 1)
     try:
         with pytest.raises(ScenarioError, match="in use by another process"):
             repair_dataset(root, [str(source_copy)])

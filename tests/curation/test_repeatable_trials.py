@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.rounding import KERNELS, has_kernels
+from lerobot_roborecover.utils.determinism import KERNELS, has_kernels
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.processes import PATIENCE_S
 
@@ -36,12 +36,12 @@ def test_a_policys_trials_do_not_depend_on_the_number_of_simulators(tmp_path):
 
 PROGRAM = """
     import hashlib, sys
-    from lerobot_roborecover.rounding import pin_policy_kernels
+    from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
     assert pin_policy_kernels()
     import numpy as np, torch
     from lerobot_roborecover.curation.policy_trials import env_config
-    from lerobot_roborecover.trials.load import HostSpec, load_host, policy_config
+    from lerobot_roborecover.evaluation.loading import HostSpec, load_host, policy_config
 
     assert not pin_policy_kernels(), "torch is loaded: nothing can be chosen any more"
     rng = np.random.default_rng(0)

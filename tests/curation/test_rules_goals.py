@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_roborecover.curation.annotation.annotators import EYES
-from lerobot_roborecover.curation.annotation.looking import Look, Sheet
+from lerobot_roborecover.curation.annotation.annotators import LABELERS
+from lerobot_roborecover.curation.annotation.features import EpisodeFeatures, EpisodeInfo
 from lerobot_roborecover.curation.annotation.rules import _Seen
 
 FRAMES = range(0, 40, 2)
@@ -14,9 +14,9 @@ FRAMES = range(0, 40, 2)
 
 def look(
     reach: dict[str, float], goal: dict[str, float], *, human: bool = False, paused: range = range(0)
-) -> Look:
+) -> EpisodeFeatures:
     """A look of constant distances; the hand stands still at some frames."""
-    made = Look(Sheet("it", "", FRAMES[-1], 20.0, False, human=human))
+    made = EpisodeFeatures(EpisodeInfo("it", "", FRAMES[-1], 20.0, False, human=human))
     for f in FRAMES:
         made.readings[f] = {"hand": {"speed": 0.0 if f in paused else 0.5, "a6": 1.0}}
         for name in reach:
@@ -35,7 +35,7 @@ def look(
     ],
 )
 def test_of_several_objects_with_goals_it_is_the_nearest_that_is_not_there_yet(reach, goal, handled):
-    assert _Seen(look(reach, goal), EYES["auto-1"]).main == handled
+    assert _Seen(look(reach, goal), LABELERS["auto-1"]).main == handled
 
 
 def test_of_a_human_made_rollout_it_is_judged_where_the_person_stopped():
@@ -44,5 +44,5 @@ def test_of_a_human_made_rollout_it_is_judged_where_the_person_stopped():
         if f > 24:  # both are placed in the end, the sauce last
             made.readings[f]["soup"] |= {"goal": 0.01, "reach": 0.4}
             made.readings[f]["sauce"] |= {"goal": 0.01, "reach": 0.1}
-    assert _Seen(made, EYES["auto-1"]).main == "soup"
-    assert np.isfinite(_Seen(made, EYES["auto-1"]).goal).all()
+    assert _Seen(made, LABELERS["auto-1"]).main == "soup"
+    assert np.isfinite(_Seen(made, LABELERS["auto-1"]).goal).all()

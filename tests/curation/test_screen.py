@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
+from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.screen.runs import forget_trials, parse_policies, take_trials
 from lerobot_roborecover.curation.screen.screening import ScreenRule, provenance_of, screen, tally
 from lerobot_roborecover.curation.screen.tables import (
@@ -28,8 +28,8 @@ from lerobot_roborecover.curation.screen.tables import (
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import last_frames
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_scenario
@@ -271,7 +271,7 @@ def screened(scenario_set, checkpoints, tmp_path_factory):
 
     out = tmp_path_factory.mktemp("screened") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lerobot_roborecover.trials.load.load_host", load_push_host)
+        patch.setattr("lerobot_roborecover.evaluation.loading.load_host", load_push_host)
         assert main(command(scenario_set, checkpoints, out)) == 0
     return out
 
@@ -315,7 +315,7 @@ def test_written_with_provenance_and_history(screened, scenario_set, checkpoints
 def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):
     from tests.support.push_checkpoints import load_push_host
 
-    monkeypatch.setattr("lerobot_roborecover.trials.load.load_host", load_push_host)
+    monkeypatch.setattr("lerobot_roborecover.evaluation.loading.load_host", load_push_host)
     parts = []
     for k in range(2):
         part = tmp_path / f"part-{k}"
@@ -328,7 +328,7 @@ def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, t
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:3]) + '{"cut')
     loads = []
     monkeypatch.setattr(
-        "lerobot_roborecover.trials.load.load_host", lambda c: loads.append(c) or load_push_host(c)
+        "lerobot_roborecover.evaluation.loading.load_host", lambda c: loads.append(c) or load_push_host(c)
     )
     assert main(command(scenario_set, checkpoints[::-1], tmp_path / "out", *parts)) == 0
     assert len(loads) == 1, "only the policy whose trials were lost runs again"
@@ -341,7 +341,7 @@ def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, t
 def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):
     from tests.support.push_checkpoints import load_push_host
 
-    monkeypatch.setattr("lerobot_roborecover.trials.load.load_host", load_push_host)
+    monkeypatch.setattr("lerobot_roborecover.evaluation.loading.load_host", load_push_host)
     assert main(command(scenario_set, checkpoints, tmp_path / "out", "--curtail")) == 0
     assert "stays" in capsys.readouterr().out
     ids = {s.id for s in read_scenarios(screened)}
@@ -367,7 +367,7 @@ def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, c
 def test_kills_lose_nothing(screened, scenario_set, checkpoints, tmp_path, monkeypatch):
     from tests.support.push_checkpoints import load_push_host
 
-    monkeypatch.setattr("lerobot_roborecover.trials.load.load_host", load_push_host)
+    monkeypatch.setattr("lerobot_roborecover.evaluation.loading.load_host", load_push_host)
     argv = command(scenario_set, checkpoints, tmp_path / "out")
     logs = [tmp_path / "out.trials" / p.name / "trials.jsonl" for p in checkpoints]
     complete = {}

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli import split as command
-from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
+from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.split import (
     SplitConfig,
     assign,

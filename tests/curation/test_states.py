@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
+from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
 from lerobot_roborecover.curation.split_dataset import SPLIT_FILE
 from lerobot_roborecover.curation.validate import states
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.attrition import Decision, count_stages, read_decisions, record_decisions
+from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.validate.dataset import validate_dataset
 from lerobot_roborecover.curation.validate.frames import Encoder, encoded, ssim, window
 from lerobot_roborecover.curation.validate.request import ValidationRequest
@@ -32,10 +32,9 @@ from lerobot_roborecover.curation.validate.validation import (
 )
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frames import LastFrames, _encode, last_frames
-from lerobot_roborecover.env.trial import actions_digest
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Pose, ScenarioError
 from lerobot_roborecover.workers.jobs import JobPool
 from tests.support.factories import fake_scenario

@@ -15,10 +15,9 @@ from lerobot_roborecover.curation.candidates_write import Recording, write_candi
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
-from lerobot_roborecover.env.trial import actions_digest
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.walk import walk
+from lerobot_roborecover.platforms.stepping import iter_steps
 from tests.support.trial_rows import trial_row
 
 SIDE, STEPS, POINT = 96, 40, 25
@@ -42,7 +41,7 @@ def recording(simulator, index: int, every: int, spoilt: bool) -> Recording:
         stop_when_solved=False,
     )  # fmt: skip
     frames = []
-    for t in walk(simulator, made.rollout, STEPS - 1):
+    for t in iter_steps(simulator, made.rollout, STEPS - 1):
         frames.append(to_frame("metaworld", simulator.observe()) if t % every == 0 else frames[-1])
     if spoilt:
         frames[POINT] = {

@@ -20,7 +20,7 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import camera_pictures, last_frames
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_scenario
 

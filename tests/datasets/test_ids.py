@@ -15,6 +15,8 @@ from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.release.convert import read_release
 from lerobot_roborecover.datasets.release.export import export_release
 from lerobot_roborecover.datasets.release.tables import check_row
+from lerobot_roborecover.evaluation.videos import VideoRecorder
+from lerobot_roborecover.evaluation.work_items import WorkItem
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_SUITES, libero_tasks
 from lerobot_roborecover.scenario import (
     MAX_ID_CHARS,
@@ -25,9 +27,7 @@ from lerobot_roborecover.scenario import (
     Stage,
     is_id,
 )
-from lerobot_roborecover.trials.units import Unit
-from lerobot_roborecover.trials.videos import VideoKeeper
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 from tests.support.factories import fake_scenario
 from tests.support.release_files import libero_record, read_rows, real_id, write_release
 
@@ -67,10 +67,10 @@ def test_ids_of_the_real_form_are_ids_of_everything(folder, suite, task, episode
 def test_a_long_id_is_a_file_name_with_all_that_is_added_to_it(tmp_path, length):
     name = "x" * length
     scenario = named(fake_scenario(0), name)
-    films = VideoKeeper(tmp_path / "films", 9, "all", [name])
+    films = VideoRecorder(tmp_path / "films", 9, "all", [name])
     frame = np.zeros((16, 16, 3), np.uint8)
     for outcome in Outcome:
-        unit = Unit(scenario, 2**32 - 1)
+        unit = WorkItem(scenario, 2**32 - 1)
         films.finish(films.begin(unit, frame, 10.0), unit, outcome)
     assert len(films.kept) == len(Outcome)
     for path in (
@@ -80,7 +80,7 @@ def test_a_long_id_is_a_file_name_with_all_that_is_added_to_it(tmp_path, length)
         # LeRobot's own folder of a scenario's videos (lerobot_eval.py), with the longest group of ours.
         tmp_path / f"Approach-Stage Rollback_{name}" / "eval_episode_0.mp4",
     ):
-        write_whole(path, b"whole")
+        atomic_write(path, b"whole")
         assert path.read_bytes() == b"whole"
 
 

@@ -15,7 +15,7 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.inspect import replay_moments
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from tests.support.factories import fake_dataset
 from tests.support.processes import PATIENCE_S
 

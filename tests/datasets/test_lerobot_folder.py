@@ -109,7 +109,7 @@ def test_what_is_not_whole_is_refused_in_one_line(root, name):
 
 @pytest.mark.lerobot
 def test_tasks_are_taken_by_their_index(tmp_path):
-    from lerobot_roborecover.curation.detection.fitting import training_states
+    from lerobot_roborecover.detection.fitting import training_states
 
     root = lerobot_folder(tmp_path / "set", TASKS)
     write_tasks(root, TASKS[::-1], [2, 1, 0])

@@ -20,7 +20,7 @@ from lerobot_roborecover.datasets.trajectory_write import write_trajectories
 from lerobot_roborecover.datasets.update import PENDING
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.words import counted
+from lerobot_roborecover.utils.text import pluralize
 from tests.datasets.test_trajectories import trajectory
 from tests.support.factories import fake_scenario
 from tests.support.release_files import files_of
@@ -95,7 +95,7 @@ def test_tools_of_lerobot_lose_our_metadata_and_repair_brings_it_back(
     assert files_of(root) == before
     assert main(arguments) == 0
     said = capsys.readouterr().out
-    assert f"{len(expected)} episodes found again in {counted(len(names), 'source')}" in said
+    assert f"{len(expected)} episodes found again in {pluralize(len(names), 'source')}" in said
     check(root, expected)
     dataset = LeRobotDataset("lab/x", root=root)
     assert dataset.num_episodes == len(expected)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.attrition import Decision, read_decisions, record_decisions
+from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
 from lerobot_roborecover.curation.split import SplitConfig
 from lerobot_roborecover.curation.split_dataset import check_splits, split_dataset
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios

@@ -147,7 +147,7 @@ def test_what_the_encoder_dropped_is_not_written(stalled, tmp_path, monkeypatch)
     """With LeRobot's own way of feeding: it drops what a stalled encoder has no room for."""
     from lerobot.datasets.video_utils import StreamingVideoEncoder
 
-    monkeypatch.setattr(stalled, "PatientEncoder", StreamingVideoEncoder)
+    monkeypatch.setattr(stalled, "BlockingEncoder", StreamingVideoEncoder)
     with pytest.raises(ScenarioError, match=r"rollout 0 \(episode 0\), camera .*wrote \d+ video.* for 12 st"):
         write(tmp_path / "set")
 

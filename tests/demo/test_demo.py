@@ -23,11 +23,11 @@ from lerobot_roborecover.demo.evaluate import eval_command
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.run import run_demo, spread
 from lerobot_roborecover.demo.settings import DemoSettings, claim_folder, hold_folder
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import Protocol, make_row
-from lerobot_roborecover.rounding import policy_kernels
+from lerobot_roborecover.evaluation.progress import LogTail, ProgressLine, RunProgress
+from lerobot_roborecover.logs.row import EvalProtocol, make_row
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.trials.progress import LogTail, ProgressLine, Tally
+from lerobot_roborecover.utils.determinism import policy_kernels
 from tests.support.exactness import row_as_recorded
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.processes import PATIENCE_S
@@ -38,8 +38,8 @@ import os
 import sys
 from pathlib import Path
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.env.trial_log import TrialLog
-from lerobot_roborecover.env.trial_row import Protocol, make_row
+from lerobot_roborecover.logs.trial_log import TrialLog
+from lerobot_roborecover.logs.row import Protocol, make_row
 from lerobot_roborecover.scenario import Outcome
 
 fail_after = int(sys.argv[1])
@@ -101,7 +101,7 @@ def settings(tmp_path, dataset):
 
 
 def rows_of(dataset, outcomes: dict[str, list[str]], start: str = "recovery", **more) -> list[dict]:
-    protocol = Protocol(start=start, rewind_steps=0, policy="act@1", run_seed=1, execution_horizon=1)
+    protocol = EvalProtocol(start=start, rewind_steps=0, policy="act@1", run_seed=1, execution_horizon=1)
     scenarios = load_scenarios(str(dataset))
     return [
         asdict(
@@ -191,7 +191,7 @@ def test_a_killed_demo_leaves_no_run_behind_that_holds_the_log(settings, tmp_pat
     hangs = tmp_path / "hangs.py"
     hangs.write_text(
         "import os, pathlib, time\n"
-        "from lerobot_roborecover.env.trial_log import TrialLog\n"
+        "from lerobot_roborecover.logs.trial_log import TrialLog\n"
         f"log = TrialLog(pathlib.Path({str(settings().trial_log)!r}))\n"
         f"pathlib.Path({str(child)!r}).write_text(f'{{os.getpid()}} ')\n"
         "time.sleep(600)\n"
@@ -272,7 +272,7 @@ def test_log_tail_waits_for_the_end_of_a_line(tmp_path):
 
 def test_progress_counts_what_was_asked_for(dataset):
     ids = ["fake-push-left-000", "fake-push-right-001"]
-    tally = Tally("recovery", ids, 2)
+    tally = RunProgress("recovery", ids, 2)
     outcomes = {ids[0]: ["success", "horizon", "success"], "fake-push-left-002": ["success"]}
     tally.add(rows_of(dataset, outcomes) + rows_of(dataset, {ids[1]: ["success"]}, start="initial"))
     assert (tally.done, tally.total, tally.rate) == (2, 4, 0.5)
@@ -282,7 +282,7 @@ def test_progress_counts_what_was_asked_for(dataset):
 
 def test_progress_line_tells_the_pace_of_trials_alone(dataset):
     ids = ["fake-push-left-000", "fake-push-right-001"]
-    tally = Tally("recovery", ids, 3)
+    tally = RunProgress("recovery", ids, 3)
     now = [0.0]
     stream = io.StringIO()
     progress = ProgressLine("recovery", stream, lambda: now[0])
@@ -302,7 +302,7 @@ def test_progress_line_tells_the_pace_of_trials_alone(dataset):
 
 
 def test_progress_in_a_file_repeats_itself_only_now_and_then(dataset):
-    tally = Tally("recovery", ["fake-push-left-000"], 3)
+    tally = RunProgress("recovery", ["fake-push-left-000"], 3)
     now = [0.0]
     stream = io.StringIO()
     progress = ProgressLine("recovery", stream, lambda: now[0])

@@ -18,8 +18,8 @@ import yaml
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms import platform_named, platform_names
 from lerobot_roborecover.platforms.check import CheckRequest, check_platform
+from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.platforms.versions import installed
-from lerobot_roborecover.platforms.walk import walk
 from lerobot_roborecover.scenario import Reset
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "maniskill"
@@ -146,7 +146,7 @@ def test_starter_scenarios_come_back_as_they_were_recorded(name):
     recorded = scenarios[0].fingerprint.versions
     same = all(installed(package) == recorded[package] for package in ("mani-skill", "sapien"))
     for scenario in scenarios:
-        for _ in walk(simulator, scenario.rollout):
+        for _ in iter_steps(simulator, scenario.rollout):
             pass
         bodies = simulator.bodies()
         for body, pose in scenario.fingerprint.bodies.items():

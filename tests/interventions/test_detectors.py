@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_roborecover.interventions.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from tests.support.factories import save_policy
 from tests.support.small_interventions import HashMonitor
 
@@ -29,9 +29,9 @@ def walk_of(steps: int, seed: int = 0) -> list[dict]:
 
 
 def windows(observations, past: int, *, text: str = "go", seed: int = 7, **known) -> list:
-    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+    from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
-    glimpses = [Glimpse(o) for o in observations]
+    glimpses = [StepObservation(o) for o in observations]
     return [
         DetectorWindow(glimpses[max(n - past, 0) : n + 1], text, n, seed, **known)
         for n in range(len(glimpses))
@@ -39,7 +39,7 @@ def windows(observations, past: int, *, text: str = "go", seed: int = 7, **known
 
 
 def load(what: str, **options):
-    from lerobot_roborecover.interventions.detectors.loading import load_detector
+    from lerobot_roborecover.policies.detectors.loading import load_detector
 
     return load_detector(what, "cpu", **options)
 
@@ -47,9 +47,9 @@ def load(what: str, **options):
 @pytest.fixture(scope="module")
 def probes(tmp_path_factory):
     """Into a policy that is deterministic, and into one that draws noise and keeps observations."""
-    from lerobot_roborecover.interventions.configuration_intervention import MemberConfig
-    from lerobot_roborecover.interventions.detectors.probe import PolicyProbe
-    from lerobot_roborecover.interventions.members import load_member
+    from lerobot_roborecover.policies.detectors.probe import PolicyProbe
+    from lerobot_roborecover.policies.interventions.configuration_intervention import MemberConfig
+    from lerobot_roborecover.policies.interventions.members import load_member
 
     made = {}
     for kind in ("act", "diffusion"):
@@ -142,13 +142,13 @@ def test_states_are_compared_within_their_task():
 def test_chunks_that_contradict_each_other():
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+    from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
     detector = load("chunk_disagreement,lag=1,samples=2")
     line = torch.arange(5.0)
 
     def score(before, now):
-        glimpses = [Glimpse({}, c[:, :, None]) for c in (before, now)]
+        glimpses = [StepObservation({}, c[:, :, None]) for c in (before, now)]
         return float(detector.judge_windows([DetectorWindow(glimpses, "go", 1)]).scores[0])
 
     same = line.expand(2, 5)
@@ -159,7 +159,11 @@ def test_chunks_that_contradict_each_other():
     two = torch.stack([line, -line])
     assert score(two, torch.stack([line + 1, -line - 1])) == pytest.approx(0.0, abs=1e-6)
     assert (
-        float(detector.judge_windows([DetectorWindow([Glimpse({}, two[:, :, None])], "go", 0)]).scores[0])
+        float(
+            detector.judge_windows([DetectorWindow([StepObservation({}, two[:, :, None])], "go", 0)]).scores[
+                0
+            ]
+        )
         == 0.0
     )
     with pytest.raises(MonitorError, match=r"lag=1: the policy's chunks have 1 steps.*Set lag below 1"):
@@ -170,7 +174,7 @@ def test_chunks_that_contradict_each_other():
 def test_looking_into_a_policy_touches_nothing_and_depends_on_nothing_else(kind, probes):
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds
+    from lerobot_roborecover.policies.detectors.interface import DetectorNeeds
 
     probe, seen = probes[kind], walk_of(6)
     asked = [seen[max(n - probe.past, 0) : n + 1] for n in range(6)]
@@ -201,7 +205,7 @@ def test_looking_into_a_policy_touches_nothing_and_depends_on_nothing_else(kind,
 def test_a_network_on_features_learns_and_comes_back(tmp_path):
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+    from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
     rng = np.random.default_rng(0)
     labels = torch.from_numpy((np.arange(400) % 4 == 0).astype(np.float32))
@@ -211,7 +215,7 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
     state = torch.get_rng_state()
     detector.fit(features, labels)
     assert torch.equal(torch.get_rng_state(), state)
-    asked = [DetectorWindow([Glimpse({}, None, f)], "go", 0) for f in features]
+    asked = [DetectorWindow([StepObservation({}, None, f)], "go", 0) for f in features]
     said = detector.judge_windows(asked).scores
     assert said[labels == 1].mean() > 0.7 > 0.4 > said[labels == 0].mean()
     detector.save_pretrained(tmp_path)
@@ -219,14 +223,14 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
     with pytest.raises(MonitorError, match="400 frames where the policy goes on by itself and 0"):
         load("policy_features").fit(features, torch.zeros(400))
     with pytest.raises(MonitorError, match="fitted to 8 features; the policy has 3"):
-        detector.judge_windows([DetectorWindow([Glimpse({}, None, torch.zeros(3))], "go", 0)])
+        detector.judge_windows([DetectorWindow([StepObservation({}, None, torch.zeros(3))], "go", 0)])
 
 
 def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
     """Half rescued and half harmed is no gain, three rescued of four are 0.75; never a threshold below 0."""
     import torch
 
-    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+    from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
     places = np.eye(3, dtype=np.float32)
     gains = {0: [1, -1, 1, -1], 1: [1, 1, 1, 0], 2: [0, 0, -1, 0]}
@@ -235,7 +239,7 @@ def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
     detector = load("recovery_gain,steps=800,hidden_dim=16,learning_rate=0.02,dropout=0,weight_decay=0")
     detector.fit(features, found)
     assert detector.config.labels == {"rescued": 100, "harmed": 60, "alike": 80}
-    asked = [DetectorWindow([Glimpse({}, None, torch.from_numpy(p))], "go", 0) for p in places]
+    asked = [DetectorWindow([StepObservation({}, None, torch.from_numpy(p))], "go", 0) for p in places]
     said = detector.judge_windows(asked)
     np.testing.assert_allclose(said.scores, [0.0, 0.75, -0.25], atol=0.05)
     assert list(said.triggers[1:]) == [True, False]
@@ -250,13 +254,17 @@ def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
 @pytest.mark.parametrize("kind", ["act", "diffusion"])
 def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
     """A detector beside trials under way, in a batch with another one, against windows made afterwards."""
-    from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds, DetectorWindow, Glimpse
-    from lerobot_roborecover.interventions.detectors.watching import Watcher, noise_seed
+    from lerobot_roborecover.policies.detectors.interface import (
+        DetectorNeeds,
+        DetectorWindow,
+        StepObservation,
+    )
+    from lerobot_roborecover.policies.detectors.online import OnlineDetector, noise_seed
 
     detector = load("chunk_disagreement,lag=2,samples=2")
     probe = probes[kind]
     trials = {11: walk_of(7, 1), 12: walk_of(7, 2)}
-    watcher = Watcher(detector, probe)
+    watcher = OnlineDetector(detector, probe)
     watches = [watcher.start(seed) for seed in trials]
     live = []
     for step in range(7):
@@ -268,7 +276,7 @@ def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
             probe.look([walk[max(n - probe.past, 0) : n + 1]], ["go"], [noise_seed(seed, n)], needs)[0][0]
             for n in range(7)
         ]
-        glimpses = [Glimpse(o, c) for o, c in zip(walk, chunks, strict=True)]
+        glimpses = [StepObservation(o, c) for o, c in zip(walk, chunks, strict=True)]
         after = detector.judge_windows(
             [DetectorWindow(glimpses[max(n - 2, 0) : n + 1], "go", n, seed) for n in range(7)]
         )
@@ -277,7 +285,7 @@ def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
 
 
 def test_a_monitor_is_a_detector_that_looks_at_now():
-    from lerobot_roborecover.interventions.detectors.interface import as_detector
+    from lerobot_roborecover.policies.detectors.interface import as_detector
 
     monitor = HashMonitor()
     detector = as_detector(monitor)
@@ -315,8 +323,8 @@ def test_options_that_cannot_be_used(what, message, monkeypatch):
 def test_what_is_missing_is_said_before_anything_runs(probes):
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.interventions.detectors.interface import DetectorNeeds
-    from lerobot_roborecover.interventions.detectors.loading import check_needs
+    from lerobot_roborecover.policies.detectors.interface import DetectorNeeds
+    from lerobot_roborecover.policies.detectors.loading import check_needs
 
     there = {STATE: PolicyFeature(FeatureType.STATE, (4,))}
     with pytest.raises(

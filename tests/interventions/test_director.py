@@ -7,18 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.env.directives import BY_RULE, Controller, split
-from lerobot_roborecover.policies.host import PolicyError
+from lerobot_roborecover.policies.runner import PolicyError
+from lerobot_roborecover.workers.control_columns import BY_RULE, Controller, split
 from tests.support.small_interventions import CountingMember, ScriptedDriver, observation
 
 pytestmark = pytest.mark.lerobot
 
 
 def director(mode, *, monitor=None, driver=None, correction_steps=5):
-    from lerobot_roborecover.interventions.director import Director
+    from lerobot_roborecover.policies.interventions.controller import InterventionController
 
     members = {Controller.BASE: CountingMember(1.0, 4), Controller.CORRECTION: CountingMember(2.0, 3)}
-    return Director(members, mode, monitor=monitor, driver=driver, correction_steps=correction_steps)
+    return InterventionController(
+        members, mode, monitor=monitor, driver=driver, correction_steps=correction_steps
+    )
 
 
 def run_alone(made, values, bad=()):
@@ -45,7 +47,7 @@ class At:
         self.asked = []
 
     def judge(self, observations, instructions):
-        from lerobot_roborecover.interventions.monitor_interface import Verdicts
+        from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
 
         values = observations["observation.state"][:, 0].numpy()
         self.asked += values.tolist()

@@ -22,7 +22,7 @@ CONFIGS = Path(__file__).parents[2] / "policies" / "train"
 def test_the_average_is_the_defined_one_and_survives_a_reload_in_float32():
     import torch
 
-    from lerobot_roborecover.interventions.ema import SHADOW, EmaAdamW
+    from lerobot_roborecover.policies.ema import SHADOW, EmaAdamW
 
     def train(weight, optimizer, steps, first=0):
         for step in range(first, first + steps):
@@ -149,7 +149,7 @@ def test_correction_of_a_vision_language_policy(kind, executed, tmp_path, monkey
     from lerobot.policies import get_policy_class
     from lerobot.policies.pi05 import modeling_pi05
 
-    from lerobot_roborecover.interventions.export_ema import export_ema
+    from lerobot_roborecover.policies.export_ema import export_ema
     from tests.support.small_families import fix_sizes, save_family
     from tests.support.small_hub import make_hub
 

@@ -10,15 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.intervention_options import InterventionFacts
-from lerobot_roborecover.env.options import OptionError, RecoveryOptions
-from lerobot_roborecover.env.run import PlatformPart, open_run
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.vector_env import create_recovery_envs
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.options import RecoveryOptions
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.vector_env import create_recovery_envs
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.policies.interventions.options import InterventionFacts
+from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.trials.engine import units_of
-from lerobot_roborecover.trials.local import LocalEngine
 from lerobot_roborecover.workers.messages import SlotConfig
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.loop import outcomes
@@ -43,7 +44,7 @@ def checkpoints(tmp_path_factory):
 
 @pytest.fixture
 def monitor(monkeypatch):
-    from lerobot_roborecover.interventions import monitor_loading
+    from lerobot_roborecover.policies.detectors import monitor_loading
 
     made = HashMonitor()
     monkeypatch.setattr(monitor_loading, "load_monitor", lambda *_, **__: made)
@@ -54,8 +55,8 @@ def composite(checkpoints, mode, *, base="act", correction="diffusion", **option
     """The policy and its processors, as `lerobot-eval` would have them."""
     from lerobot.policies import make_policy, make_pre_post_processors
 
-    from lerobot_roborecover.env.configs import ENV_TYPES
-    from lerobot_roborecover.interventions.configuration_intervention import (
+    from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
+    from lerobot_roborecover.policies.interventions.configuration_intervention import (
         MemberConfig,
         MonitorConfig,
         RoboRecoverInterventionConfig,
@@ -78,12 +79,14 @@ def composite(checkpoints, mode, *, base="act", correction="diffusion", **option
 
 
 def opened(dataset, log, mode, n_envs=None):
-    facts = RunFacts(policy="p", n_episodes=TRIALS, intervention=InterventionFacts(mode, 6, {"base": "p"}))
+    facts = PolicyMetadata(
+        policy="p", n_episodes=TRIALS, intervention=InterventionFacts(mode, 6, {"base": "p"})
+    )
     options = RecoveryOptions(scenarios=str(dataset), trial_log=str(log))
-    spec = PlatformPart(SlotConfig("fake"), {}, None)
+    spec = SimulatorSpec(SlotConfig("fake"), {}, None)
     if n_envs:
         return create_recovery_envs(options, spec, n_envs=n_envs, workers=False, facts=facts)
-    return open_run(options, spec, workers=True, facts=facts)
+    return create_session(options, spec, workers=True, facts=facts)
 
 
 def engine_rows(dataset, log, made, mode, slots):
@@ -146,8 +149,8 @@ def test_a_person_at_the_page_takes_over_under_both_evaluators(
     dataset, checkpoints, monitor, tmp_path, monkeypatch
 ):
     """They drive three steps forward and hand back; by the page's own websocket."""
-    from lerobot_roborecover.studio.teleop.client import Client, TeleopRefusal
-    from lerobot_roborecover.studio.teleop.takeover import Takeover
+    from lerobot_roborecover.web.teleop.client import Client, TeleopRefusal
+    from lerobot_roborecover.web.teleop.takeover import Takeover
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     made, taker = composite(checkpoints, "human"), Takeover(0)
@@ -195,12 +198,12 @@ def test_a_trigger_never_reaches_another_slot(dataset, checkpoints, monitor, tmp
 def test_mode_reversion_and_start_reversion_agree(dataset, checkpoints, tmp_path):
     made = composite(checkpoints, "reversion")
     rolled = engine_rows(dataset, tmp_path / "rolled.jsonl", made, "reversion", slots=1)
-    scenarios, run = open_run(
+    scenarios, run = create_session(
         RecoveryOptions(
             scenarios=str(dataset), trial_log=str(tmp_path / "s.jsonl"), start="reversion", rewind_steps=6
         ),
-        PlatformPart(SlotConfig("fake"), {}, None), workers=True,
-        facts=RunFacts(policy="p", n_episodes=TRIALS),
+        SimulatorSpec(SlotConfig("fake"), {}, None), workers=True,
+        facts=PolicyMetadata(policy="p", n_episodes=TRIALS),
     )  # fmt: skip
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
@@ -319,8 +322,8 @@ def test_what_ships_for_libero_fits_its_environment(mode):
     """LIBERO's own features name parts of the robot's state, and policies get one vector."""
     from lerobot.policies import make_policy
 
-    from lerobot_roborecover.env.configs import ENV_TYPES
-    from lerobot_roborecover.interventions.configuration_intervention import (
+    from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
+    from lerobot_roborecover.policies.interventions.configuration_intervention import (
         MemberConfig,
         MonitorConfig,
         RoboRecoverInterventionConfig,

@@ -14,18 +14,12 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.curation.monitor_data.choice import (
-    BALANCED,
-    NATURAL,
-    TRAIN,
-    Continuation,
-    DataOptions,
-    choose,
-)
-from lerobot_roborecover.curation.monitor_data.data import write_monitor_data
-from lerobot_roborecover.interventions.monitor.errors import MonitorError
-from lerobot_roborecover.interventions.monitor_interface import Monitor
-from lerobot_roborecover.interventions.monitor_loading import load_monitor
+from lerobot_roborecover.curation.continuations import Continuation
+from lerobot_roborecover.detection.data.choice import BALANCED, NATURAL, TRAIN, DataOptions, choose
+from lerobot_roborecover.detection.data.data import write_monitor_data
+from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.monitor_interface import Monitor
+from lerobot_roborecover.policies.detectors.monitor_loading import load_monitor
 from tests.support.factories import fake_scenario
 from tests.support.training import lerobot_train
 
@@ -149,10 +143,10 @@ def qwen_monitor(base: Path, **settings):
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.interventions.monitor.configuration_roborecover_monitor import (
+    from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor import (
         RoboRecoverMonitorConfig,
     )
-    from lerobot_roborecover.interventions.monitor.modeling_roborecover_monitor import (
+    from lerobot_roborecover.policies.detectors.monitor.modeling_roborecover_monitor import (
         RoboRecoverMonitorRewardModel,
     )
 
@@ -367,7 +361,7 @@ def test_training_ends_with_a_push(data, base, tmp_path, monkeypatch):
     from huggingface_hub import RepoCard
     from lerobot.common import train_utils
 
-    from lerobot_roborecover.interventions.monitor import base as module
+    from lerobot_roborecover.policies.detectors.monitor import base as module
 
     uploads: list[tuple[str, set[str]]] = []
 

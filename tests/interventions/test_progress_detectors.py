@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.interventions.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from tests.support.small_qwen3vl import small_qwen3vl
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.slow]
@@ -17,7 +17,7 @@ CLIP = "openai/clip-vit-base-patch32"
 
 
 def load(what: str):
-    from lerobot_roborecover.interventions.detectors.loading import load_detector
+    from lerobot_roborecover.policies.detectors.loading import load_detector
 
     return load_detector(what, "cpu")
 
@@ -38,9 +38,9 @@ def film(steps: int, size: int = 64) -> list[dict]:
 
 def ask(detector, seen, steps):
     """What it says at the steps, each with its own history."""
-    from lerobot_roborecover.interventions.detectors.interface import DetectorWindow, Glimpse
+    from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
-    glimpses = [Glimpse(o) for o in seen]
+    glimpses = [StepObservation(o) for o in seen]
     past = detector.needs.past
     return detector.judge_windows(
         [DetectorWindow(glimpses[max(n - past, 0) : n + 1], "push the puck", n) for n in steps]

@@ -30,7 +30,7 @@ def start(number: str, init: int):
 @pytest.mark.parametrize("number", KINDS)
 def test_each_kind_of_goal_is_solved(simulator, number):
     task, reset = start(number, 1)
-    assert PLATFORM.cannot_drive(task) == ""
+    assert PLATFORM.unsupported_reason(task) == ""
     assert solve(simulator, task, reset, "scripted") is not None
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_roborecover.curation.annotation.traces import traces
 from lerobot_roborecover.platforms.simulator import GOAL_OF, HANDLE, is_mark
-from lerobot_roborecover.recording import Recorder
+from lerobot_roborecover.replay.recorder import Recorder
 from lerobot_roborecover.scenario import Reset
 
 pytestmark = [pytest.mark.libero, pytest.mark.slow]

@@ -12,9 +12,9 @@ import lerobot_roborecover
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms.libero import PLATFORM
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Reset, Scenario, Source
-from lerobot_roborecover.snapshots import SnapshotCache
 from tests.support.exactness import as_recorded
 
 FOLDER = Path(lerobot_roborecover.__file__).parent / "data" / "libero_starter"
@@ -91,7 +91,7 @@ def test_a_recipe_makes_its_scenario_again(scenarios, simulator):
 
 
 def test_marks_are_not_among_what_moved():
-    from lerobot_roborecover.recording import Steps
+    from lerobot_roborecover.replay.recorder import Steps
     from recipes.libero.recipes import RECIPES
     from recipes.libero.starter import _provenance
 

@@ -12,9 +12,9 @@ import pytest
 
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Start
-from lerobot_roborecover.snapshots import SnapshotCache
 from tests.support.exactness import as_recorded
 
 pytestmark = pytest.mark.metaworld

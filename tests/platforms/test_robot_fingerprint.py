@@ -12,14 +12,14 @@ import pytest
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets.release.robot import check_robot
-from lerobot_roborecover.env.run import _check_versions
+from lerobot_roborecover.evaluation.session import _check_versions
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
 from lerobot_roborecover.platforms.robot_fingerprint import SAME, compare_robots
 from lerobot_roborecover.platforms.robotwin.checkout import RobotwinCheckout
 from lerobot_roborecover.platforms.robotwin.robot import SETTINGS, RobotwinRobot
 from lerobot_roborecover.platforms.urdf import Urdf
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.robotwin_checkouts import REAL, ROOT, STANDIN, on_real
 
@@ -151,7 +151,7 @@ def test_every_handoff_names_the_other_robot_before_it_resets_anything(other_roo
 
 
 def test_the_protocol_does_not_ask_which_platform(monkeypatch):
-    from lerobot_roborecover.replay import with_fingerprint
+    from lerobot_roborecover.replay.handoff import with_fingerprint
     from tests.support.factories import fake_scenario
 
     simulator = FakeSimulator()
@@ -166,7 +166,7 @@ def test_the_protocol_does_not_ask_which_platform(monkeypatch):
 
 
 def test_a_run_is_refused_before_it_starts(other_root, caplog):
-    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.errors import OptionError
 
     scenarios = [recorded_here(s) for s in SHIPPED[:3]]
     here = RobotwinCheckout(other_root).robot.fingerprint

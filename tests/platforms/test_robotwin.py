@@ -12,7 +12,7 @@ import pytest
 
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.robotwin.limits import STEP_LIMITS
-from lerobot_roborecover.replay import hand_off, with_fingerprint
+from lerobot_roborecover.replay.handoff import hand_off, with_fingerprint
 from lerobot_roborecover.scenario import Outcome, Reset, Scenario, Task
 from tests.support.robotwin_checkouts import (
     REAL,

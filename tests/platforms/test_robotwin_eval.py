@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.logs.merge import merge
+from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
-from lerobot_roborecover.replay import with_fingerprint
+from lerobot_roborecover.replay.handoff import with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Task
-from lerobot_roborecover.trials.merge import merge
 from tests.support.factories import save_policy
 from tests.support.loop import evaluate
 from tests.support.robotwin_checkouts import ROOT
@@ -44,7 +44,7 @@ def dataset(tmp_path_factory):
 
 
 def config(**options):
-    from lerobot_roborecover.env.configs import ENV_TYPES
+    from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
 
     return ENV_TYPES["robotwin"](**{"robotwin_root": ROOT, **options})
 
@@ -61,7 +61,7 @@ def config(**options):
     ],
 )
 def test_options_that_cannot_be_used(options, words):
-    from lerobot_roborecover.env.options import OptionError
+    from lerobot_roborecover.errors import OptionError
 
     with pytest.raises(OptionError) as caught:
         config(**options).run_spec()

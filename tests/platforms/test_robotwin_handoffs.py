@@ -12,9 +12,9 @@ import pytest
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import Handoff, hand_off, with_fingerprint
+from lerobot_roborecover.replay.handoff import Handoff, hand_off, with_fingerprint
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Reset, Scenario, Task
-from lerobot_roborecover.snapshots import SnapshotCache
 from tests.support.robotwin_checkouts import ROOT, can_render, on_real, on_standin, run_fresh
 
 pytestmark = pytest.mark.robotwin
@@ -105,7 +105,7 @@ def test_shipped_scenarios_hand_off_exactly_in_a_fresh_process():
     lines = run_fresh(
         f"""
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.platforms import make_simulator
 simulator = make_simulator("robotwin", robotwin_root={ROOT!r}, obs_type="state")
 for scenario in reversed(list(load_scenarios("robotwin_starter"))):
@@ -226,8 +226,8 @@ def test_approximate_snapshots_give_the_handoff_and_drift_alike(simulator, carri
 import numpy as np
 from pathlib import Path
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.replay import hand_off
-from lerobot_roborecover.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import hand_off
+from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.platforms import make_simulator
 scenario = load_scenarios({str(tmp_path / "set")!r})[0]
 simulator = make_simulator("robotwin", robotwin_root={ROOT!r}, obs_type="state")

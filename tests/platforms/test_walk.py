@@ -9,8 +9,8 @@ import pytest
 
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.walk import advance, follow, walk
-from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, Recorder
+from lerobot_roborecover.platforms.stepping import advance, follow, iter_steps
+from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, Recorder
 from lerobot_roborecover.scenario import Reset, Rollout, Task
 
 TASK = Task("fake", "toy", "push-left", "push", 60)
@@ -36,16 +36,16 @@ def by_hand() -> list[str]:
 
 def test_a_walk_stands_at_every_state_once():
     simulator = make_simulator("fake")
-    assert list(walk(simulator, ROLLOUT)) == list(range(13))
-    assert states(simulator, walk(simulator, ROLLOUT)) == by_hand()
-    assert states(simulator, walk(simulator, ROLLOUT, 4)) == by_hand()[:5]
+    assert list(iter_steps(simulator, ROLLOUT)) == list(range(13))
+    assert states(simulator, iter_steps(simulator, ROLLOUT)) == by_hand()
+    assert states(simulator, iter_steps(simulator, ROLLOUT, 4)) == by_hand()[:5]
     advance(simulator, ACTIONS[4:])
     assert simulator.state_sha256() == by_hand()[-1]
 
 
 def test_what_nobody_asks_for_is_not_executed():
     simulator = make_simulator("fake")
-    for step in walk(simulator, ROLLOUT):
+    for step in iter_steps(simulator, ROLLOUT):
         if step == 5:
             break
     assert simulator.state_sha256() == by_hand()[5]
@@ -75,7 +75,7 @@ def test_a_record_replays_and_says_what_happened():
     assert steps.perturbation.tolist() == [0] * 7 + [1] + [0] * 4
     assert steps.solved.shape == (13,)
     again = make_simulator("fake")
-    for step in walk(again, recorder.rollout):
+    for step in iter_steps(again, recorder.rollout):
         assert again.bodies() == steps.poses_at(step)
         assert again.succeeded() == steps.solved[step]
 
@@ -86,7 +86,7 @@ def test_steps_taken_back_are_not_in_the_record():
     recorder.reset(TASK, ROLLOUT.reset)
     advance(recorder, ACTIONS)
     recorder.cut(5)
-    list(walk(simulator, recorder.rollout))  # the simulator goes there as well
+    list(iter_steps(simulator, recorder.rollout))  # the simulator goes there as well
     advance(recorder, ACTIONS[5:])
     assert recorder.rollout.sha256() == ROLLOUT.sha256()
     assert len(recorder.bodies) == len(recorder.solved) == 13

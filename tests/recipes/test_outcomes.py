@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_roborecover.analysis.detection import NEEDS_HELP
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
-from lerobot_roborecover.env.trial_log import TrialLogError, read_trial_log
+from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.stepping_in import ARMS, stored_folder
 from tests.support.trial_rows import policy_rows, write_log

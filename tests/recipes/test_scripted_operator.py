@@ -7,11 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from lerobot_roborecover.curation.annotation.annotators import EYES
-from lerobot_roborecover.curation.annotation.looking import Look, Sheet, frames_to_look_at
+from lerobot_roborecover.curation.annotation.annotators import LABELERS
+from lerobot_roborecover.curation.annotation.features import EpisodeFeatures, EpisodeInfo, frames_to_look_at
 from lerobot_roborecover.curation.annotation.rules import judge
 from lerobot_roborecover.curation.annotation.traces import traces
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 from lerobot_roborecover.scenario import Reset
 
 pytestmark = pytest.mark.metaworld
@@ -44,7 +44,7 @@ class Recorder:
         self._record()
         return self.solved[-1]
 
-    def look(self, eye: str) -> Look:
+    def look(self, eye: str) -> EpisodeFeatures:
         """The recording as the page shows it."""
         count = len(self.actions)
         poses = {
@@ -52,8 +52,8 @@ class Recorder:
         }
         steps = Steps(poses, np.array(self.solved), np.zeros(count, np.int8))
         shown = traces("metaworld", np.array(self.actions), steps, 80)
-        look = Look(Sheet("it", "", count - 1, 80.0, False, human=True))
-        for f in frames_to_look_at(EYES[eye].first_look, 80, count - 1):
+        look = EpisodeFeatures(EpisodeInfo("it", "", count - 1, 80.0, False, human=True))
+        for f in frames_to_look_at(LABELERS[eye].first_look, 80, count - 1):
             hand = {"speed": shown.eef_speed_m_s[f], "a3": shown.gripper["a3"][f]}
             look.readings[f] = {"hand": hand}
             for name, place in shown.places.items():
@@ -85,7 +85,7 @@ def test_a_deviation_is_what_the_rules_call_it(task, way):
     how.make(hand)
     began = len(controls.actions)
     hand.hold(STOP, how.grip)
-    found = judge(controls.look("auto-1"), EYES["auto-1"])
+    found = judge(controls.look("auto-1"), LABELERS["auto-1"])
     simulator.close()
     assert (found.stage, found.deviation) == (how.stage, how.deviation)
     # The hand is slow before it stands still.

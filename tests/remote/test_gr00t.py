@@ -11,16 +11,16 @@ import pytest
 
 pytest.importorskip("zmq", reason="pyzmq: install the gr00t extra")
 
-from lerobot_roborecover.remote.errors import (
+from lerobot_roborecover.policies.remote.errors import (
     MappingError,
     RemoteError,
-    ServerAwayError,
     ServerRefusedError,
+    ServerUnavailableError,
     WireError,
 )
-from lerobot_roborecover.remote.gr00t import pack_call, read_npy, unpack_answer
-from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
-from lerobot_roborecover.remote.translate import Translator
+from lerobot_roborecover.policies.remote.gr00t import pack_call, read_npy, unpack_answer
+from lerobot_roborecover.policies.remote.mapping import load_mapping, parse_mapping
+from lerobot_roborecover.policies.remote.translate import Translator
 from tests.support.gr00t_server import Gr00tServer, dumps, modalities
 from tests.support.serve_loop import TRIALS, dataset, evaluate, remote  # noqa: F401 - fixtures
 
@@ -77,8 +77,8 @@ def mapping(tmp_path):
 def policy(url, mapping, width=2, **options):
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     settings = {"wait_s": 2, "reconnect_s": 0.3, "timeout_s": 20, "connections": 2, **options}
     features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
@@ -286,7 +286,7 @@ def test_a_lost_server_is_away_and_one_that_comes_back_is_used(mapping):
     with server.running() as url:
         made = policy(url, mapping(), reconnect_s=0.2)
         answer = ask(made)
-        assert isinstance(answer, ServerAwayError)
+        assert isinstance(answer, ServerUnavailableError)
         assert "no policy server at" in str(answer)
     with server.running(url):
         made.server.options.__dict__["reconnect_s"] = 5.0
@@ -299,7 +299,7 @@ def test_silence_and_answers_too_large_are_named(mapping):
         made = policy(url, mapping(), max_frame_mb=1)
         assert "more than 1 MB (--policy.max_frame_mb)" in str(ask(made))
         made.server.close()
-    with pytest.raises(ServerAwayError, match=r"no policy server at tcp://127.0.0.1:9 within 0.1 s"):
+    with pytest.raises(ServerUnavailableError, match=r"no policy server at tcp://127.0.0.1:9 within 0.1 s"):
         policy("tcp://127.0.0.1:9", mapping(), wait_s=0.1)
 
 
@@ -327,7 +327,7 @@ def test_what_does_not_fit_is_refused_before_a_simulator_starts(mapping, declare
 
 
 def test_the_protocol_names_the_mapping_and_the_address(mapping):
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
 
     config = RemoteConfig(protocol="gr00t")
     assert (config.mapping, config.url) == ("gr00t_libero", "tcp://127.0.0.1:5555")

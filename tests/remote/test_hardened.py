@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from websockets.exceptions import InvalidStatus
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.remote.errors import RemoteError, WireError
-from lerobot_roborecover.remote.keys import api_key
-from lerobot_roborecover.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.errors import RemoteError, WireError
+from lerobot_roborecover.policies.remote.keys import api_key
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
 from tests.support.policy_servers import OpenpiServer, serving
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
     STATE,
@@ -60,7 +60,7 @@ class Cameras:
         return {k: v for k, v in content.items() if k.startswith("observation.")}
 
     def company(self, observation):
-        from lerobot_roborecover.remote.served import ServedPolicy
+        from lerobot_roborecover.policies.remote.served import ServedPolicy
 
         return ServedPolicy.company(self, observation)
 
@@ -168,7 +168,7 @@ def test_an_open_server_is_asked_for_by_name(checkpoints, capsys, monkeypatch): 
 
 
 def test_clients_learn_no_path(checkpoints):  # noqa: F811
-    from lerobot_roborecover.remote.serve import public_name
+    from lerobot_roborecover.policies.remote.serve import public_name
 
     folder = str(checkpoints["act"])
     assert public_name(folder) == Path(folder).name
@@ -310,8 +310,8 @@ def test_strange_frames_for_minutes(act):  # noqa: F811
 def test_a_too_wide_action_is_refused_where_it_arrives(width, tmp_path):
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     mapping = tmp_path / "mapping.yaml"
     mapping.write_text("version: 1\nabout: a server\nstate: [{key: s, parts: [{slice: [0, 4]}]}]\n")

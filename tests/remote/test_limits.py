@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.remote import limits, sockets
-from lerobot_roborecover.remote.errors import RemoteError, ServerRefusedError
-from lerobot_roborecover.remote.limits import SHARE_BYTES, ByteBudget, LimitedConnection, WrongKeys
-from lerobot_roborecover.remote.protocol import pack, unpack
-from lerobot_roborecover.remote.sessions import RequestError
+from lerobot_roborecover.policies.remote import limits, sockets
+from lerobot_roborecover.policies.remote.errors import RemoteError, ServerRefusedError
+from lerobot_roborecover.policies.remote.limits import SHARE_BYTES, ByteBudget, LimitedConnection, WrongKeys
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.sessions import RequestError
 from tests.support.policy_servers import OpenpiServer, ask, serving
 from tests.support.processes import PATIENCE_S
 from tests.support.serve_loop import STATE, checkpoints, load  # noqa: F401 - a fixture
@@ -87,7 +87,7 @@ def test_what_the_policy_does_not_take_is_not_converted(checkpoints):  # noqa: F
 def test_pictures_become_the_same_floats_as_before():
     import torch
 
-    from lerobot_roborecover.remote.served import _tensor
+    from lerobot_roborecover.policies.remote.served import _tensor
 
     pixels = np.random.default_rng(0).integers(0, 256, (2, 5, 7, 3), np.uint8)
     expected = torch.from_numpy(pixels).permute(0, 3, 1, 2).contiguous().type(torch.float32) / 255

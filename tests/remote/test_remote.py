@@ -16,15 +16,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.remote.connection import Request
-from lerobot_roborecover.remote.errors import (
+from lerobot_roborecover.policies.remote.connection import Request
+from lerobot_roborecover.policies.remote.errors import (
     MappingError,
-    ServerAwayError,
     ServerRefusedError,
+    ServerUnavailableError,
     WireError,
 )
-from lerobot_roborecover.remote.mapping import load_mapping, packaged_mappings, parse_mapping
-from lerobot_roborecover.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.mapping import load_mapping, packaged_mappings, parse_mapping
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
 from tests.support.policy_servers import OpenpiServer, ask, openpi_client, server_at  # noqa: F401 - a fixture
 from tests.support.processes import PATIENCE_S
 
@@ -178,8 +178,8 @@ def bad_server(kind):
 @pytest.mark.parametrize(
     ("kind", "error", "words"),
     [
-        ("hangs", ServerAwayError, "no answer within 0.2 s"),
-        ("closes", ServerAwayError, "closed the connection 3 times"),
+        ("hangs", ServerUnavailableError, "no answer within 0.2 s"),
+        ("closes", ServerUnavailableError, "closed the connection 3 times"),
         ("enormous", WireError, "larger than 1 MB"),
         ("pickle", WireError, "not openpi's msgpack"),
         ("garbage", WireError, "not openpi's msgpack"),
@@ -217,7 +217,7 @@ def test_nobody_there_and_somebody_else():
         free.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{free.getsockname()[1]}"
     (answer,) = ask(url, {})
-    assert isinstance(answer, ServerAwayError)
+    assert isinstance(answer, ServerUnavailableError)
     assert f"no policy server at {url}" in str(answer)
     with OpenpiServer(lambda r, c: {}).running() as url:
         (answer,) = ask(url.replace("ws://", "http://"), {})

@@ -10,13 +10,13 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.remote.errors import (
+from lerobot_roborecover.policies.remote.errors import (
     MappingError,
     RemoteError,
     WireError,
 )
-from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
-from lerobot_roborecover.remote.translate import Translator, quat_xyzw, resize
+from lerobot_roborecover.policies.remote.mapping import load_mapping, parse_mapping
+from lerobot_roborecover.policies.remote.translate import Translator, quat_xyzw, resize
 from tests.support.policy_servers import ask, openpi_client, standalone  # noqa: F401 - fixtures
 
 SERVERS = Path(__file__).parents[2] / "policies" / "servers"

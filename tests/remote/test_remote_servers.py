@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_roborecover.remote.errors import MappingError, ServerAwayError, SessionGoneError
-from lerobot_roborecover.remote.protocol import pack
+from lerobot_roborecover.policies.remote.errors import (
+    MappingError,
+    ServerUnavailableError,
+    SessionExpiredError,
+)
+from lerobot_roborecover.policies.remote.protocol import pack
 from tests.support.loop import outcomes
 from tests.support.policy_servers import OpenpiServer, openpi_client, serving  # noqa: F401 - a fixture
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
@@ -29,7 +33,7 @@ pytestmark = pytest.mark.lerobot
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     """Pauses between attempts are a thousandth of what they are."""
-    monkeypatch.setattr("lerobot_roborecover.remote.connection._FIRST_DELAY_S", 1e-4)
+    monkeypatch.setattr("lerobot_roborecover.policies.remote.connection._FIRST_DELAY_S", 1e-4)
 
 
 def write_mapping(tmp_path, text=FAKE_MAPPING):
@@ -168,7 +172,7 @@ def test_under_lerobot_eval_a_lost_server_ends_the_run(lerobot_eval, tmp_path):
         return {"actions": np.zeros((3, 2))}
 
     fake = OpenpiServer(infer)
-    with fake.running() as url, pytest.raises(ServerAwayError, match="closed the connection"):
+    with fake.running() as url, pytest.raises(ServerUnavailableError, match="closed the connection"):
         lerobot_eval(*remote(url, write_mapping(tmp_path)))
 
 
@@ -214,8 +218,8 @@ def test_a_policy_for_another_platform_is_refused(act, diffusion):
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     def make(**changes):
         options = {"url": act[0], "mapping": "lerobot", "wait_s": 1, **changes}
@@ -242,8 +246,8 @@ def test_a_policy_for_another_platform_is_refused(act, diffusion):
 
 
 def test_a_trial_whose_server_was_started_again_is_not_continued(checkpoints, tmp_path):
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     observation = {k: v.astype(np.float32) for k, v in STATE.items()}
     policy_there = load(checkpoints, "diffusion")
@@ -254,7 +258,7 @@ def test_a_trial_whose_server_was_started_again_is_not_continued(checkpoints, tm
             (answer,) = policy.ask([observation], ["push"], [slot])
             assert isinstance(answer, np.ndarray) is good
         assert "is not open, and had 1 requests" in str(answer)
-        assert isinstance(answer, SessionGoneError)
+        assert isinstance(answer, SessionExpiredError)
         policy.server.close()
 
 
@@ -269,11 +273,11 @@ def test_cosmos_policy_sees_robosuites_own_picture_and_quaternion():
     from lerobot.envs import preprocess_observation
 
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.env.configs import ENV_TYPES
+    from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
     from lerobot_roborecover.platforms import SimulatorError, make_simulator
-    from lerobot_roborecover.remote.mapping import load_mapping
-    from lerobot_roborecover.remote.modeling_remote import split
-    from lerobot_roborecover.remote.translate import Translator
+    from lerobot_roborecover.policies.remote.mapping import load_mapping
+    from lerobot_roborecover.policies.remote.modeling_remote import split
+    from lerobot_roborecover.policies.remote.translate import Translator
 
     try:
         simulator = make_simulator("libero", observation_height=64, observation_width=64)

@@ -18,8 +18,14 @@ import pytest
 import websockets.sync.client
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.remote.protocol import pack, unpack
-from lerobot_roborecover.remote.sessions import ENVELOPE, Envelope, RequestError, Sessions, read_envelope
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.sessions import (
+    ENVELOPE,
+    Envelope,
+    RequestError,
+    Sessions,
+    read_envelope,
+)
 from tests.support.loop import outcomes
 from tests.support.policy_servers import OpenpiServer, openpi_client, serving  # noqa: F401 - a fixture
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
@@ -67,9 +73,9 @@ def test_a_picture_arrives_as_the_policy_would_see_it_here(checkpoints):
     import torch
     from lerobot.envs import preprocess_observation
 
-    from lerobot_roborecover.remote.mapping import load_mapping
-    from lerobot_roborecover.remote.modeling_remote import split
-    from lerobot_roborecover.remote.translate import Translator
+    from lerobot_roborecover.policies.remote.mapping import load_mapping
+    from lerobot_roborecover.policies.remote.modeling_remote import split
+    from lerobot_roborecover.policies.remote.translate import Translator
 
     pixels = np.random.default_rng(0).integers(0, 256, (2, 16, 24, 3), np.uint8)
     batch = preprocess_observation({"pixels": {"image": pixels}, "agent_pos": np.random.rand(2, 4)})
@@ -199,9 +205,9 @@ def healthy(url):
 
 
 def test_who_has_no_key_stays_out(checkpoints, monkeypatch, tmp_path):
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.errors import RemoteError
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.errors import RemoteError
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     with serving(load(checkpoints, "act"), api_key="secret") as (url, _):
         assert healthy(url)

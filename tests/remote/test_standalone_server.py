@@ -9,8 +9,8 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
-from lerobot_roborecover.remote.errors import ServerRefusedError
-from lerobot_roborecover.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.errors import ServerRefusedError
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
 from tests.support.policy_servers import ask, openpi_client, standalone  # noqa: F401 - fixtures
 from tests.support.processes import PATIENCE_S
 

@@ -7,17 +7,17 @@ import re
 import numpy as np
 import pytest
 
-from lerobot_roborecover.remote.errors import (
+from lerobot_roborecover.policies.remote.errors import (
     MappingError,
     RemoteError,
-    ServerAwayError,
     ServerRefusedError,
-    SessionGoneError,
+    ServerUnavailableError,
+    SessionExpiredError,
     WireError,
 )
-from lerobot_roborecover.remote.mapping import load_mapping, parse_mapping
-from lerobot_roborecover.remote.translate import Translator
-from lerobot_roborecover.remote.vla_eval import pack_message, unpack_message
+from lerobot_roborecover.policies.remote.mapping import load_mapping, parse_mapping
+from lerobot_roborecover.policies.remote.translate import Translator
+from lerobot_roborecover.policies.remote.vla_eval import pack_message, unpack_message
 from tests.support.policy_servers import vla_eval  # noqa: F401 - a fixture
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
     TRIALS,
@@ -49,8 +49,8 @@ def mapping(tmp_path):
 def policy(url, mapping, width=2, **options):
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     settings = {"wait_s": 1, "reconnect_s": 0.3, "timeout_s": 20, **options}
     features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
@@ -184,11 +184,11 @@ def test_a_connection_that_is_lost_takes_its_episode_with_it(vla_eval, mapping):
         slot = made.open_slot(1)
         assert isinstance(made.ask([state(0)], ["push"], [slot])[0], np.ndarray)
         made.server._pinned[slot.session]._socket.close()
-        assert isinstance(made.ask([state(0)], ["push"], [slot])[0], SessionGoneError)
+        assert isinstance(made.ask([state(0)], ["push"], [slot])[0], SessionExpiredError)
         fresh = made.open_slot(1)
         assert isinstance(made.ask([state(0)], ["push"], [fresh])[0], np.ndarray)
     (answer,) = made.ask([state(0)], ["push"], [made.open_slot(2)])
-    assert isinstance(answer, ServerAwayError)
+    assert isinstance(answer, ServerUnavailableError)
     made.server.close()
 
 
@@ -212,8 +212,8 @@ def test_what_does_not_fit_is_refused_before_a_simulator_starts(vla_eval, mappin
 
 
 def test_the_protocol_is_the_mappings():
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.modeling_remote import RemotePolicy
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
     with pytest.raises(RemoteError, match="not one of openpi, vla_eval"):
         RemoteConfig(protocol="zmq")

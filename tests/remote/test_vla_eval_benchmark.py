@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset
 from tests.support.policy_servers import vla_eval, vla_eval_harness  # noqa: F401 - fixtures
 from tests.support.serve_loop import evaluate, remote  # noqa: F401 - fixtures

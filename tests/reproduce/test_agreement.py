@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.agreement import Standing, agreement, mixed_rate
+from lerobot_roborecover.analysis.agreement import AgreementVerdict, agreement, mixed_rate
 from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.reproduce import find_checkpoint, known_names
 from lerobot_roborecover.reproduce.arms import published_score
@@ -27,22 +27,22 @@ def test_the_interval_of_the_difference_is_newcombes():
     assert found.difference.value == pytest.approx(0.2)
     assert found.difference.low == pytest.approx(0.0524, abs=1e-4)
     assert found.difference.high == pytest.approx(0.3339, abs=1e-4)
-    assert found.standing is Standing.HIGHER
+    assert found.standing is AgreementVerdict.HIGHER
 
 
 @pytest.mark.parametrize(
     ("measured", "standing"),
     [
-        ((0.93, 0.90, 0.96), Standing.AGREES),
-        ((0.93, 0.80, 0.98), Standing.UNDECIDED),
-        ((0.70, 0.60, 0.78), Standing.LOWER),
-        ((0.99, 0.985, 1.0), Standing.HIGHER),
-        ((0.0, math.nan, math.nan), Standing.UNPUBLISHED),
+        ((0.93, 0.90, 0.96), AgreementVerdict.AGREES),
+        ((0.93, 0.80, 0.98), AgreementVerdict.UNDECIDED),
+        ((0.70, 0.60, 0.78), AgreementVerdict.LOWER),
+        ((0.99, 0.985, 1.0), AgreementVerdict.HIGHER),
+        ((0.0, math.nan, math.nan), AgreementVerdict.UNPUBLISHED),
     ],
 )
 def test_what_may_be_said(measured, standing):
     assert agreement(Estimate(*measured), Estimate(0.9417, 0.915, 0.965)).standing is standing
-    assert agreement(Estimate(*measured), None).standing is Standing.UNPUBLISHED
+    assert agreement(Estimate(*measured), None).standing is AgreementVerdict.UNPUBLISHED
 
 
 def test_a_published_rate_without_interval_is_taken_as_exact():

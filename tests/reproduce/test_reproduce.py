@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset, save_policy
 
 pytestmark = pytest.mark.lerobot

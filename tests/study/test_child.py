@@ -15,7 +15,7 @@ from tests.support.processes import PATIENCE_S
 WORKS = """
 import sys, time
 from pathlib import Path
-from lerobot_roborecover.signals import stop_signals_raise
+from lerobot_roborecover.utils.signals import stop_signals_raise
 with stop_signals_raise():
     try:
         Path(sys.argv[1], "began").touch()

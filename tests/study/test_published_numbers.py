@@ -105,7 +105,7 @@ def test_one_inversion_is_shown_on_meta_world_and_none_over_tasks(results):
     assert not [p for p in tasks if p.shown < 0]
     rows = cells("docs/study.md")
     for pair in inverted:
-        initial = pair.initial if pair.initial.difference.value > 0 else pair.initial.turned()
+        initial = pair.initial if pair.initial.difference.value > 0 else pair.initial.reversed()
         (row,) = (row for row in rows if row[:2] == [initial.a, initial.b])
         assert row[2] == shown(initial.difference, "points")
         assert row[-1] == ("yes" if pair.shown < 0 else "no")

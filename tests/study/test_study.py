@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.study.arms import arms
 from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition

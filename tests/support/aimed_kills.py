@@ -74,9 +74,9 @@ def run(work: Callable[[Path], object], source: Path, folder: Path) -> int:
 
 
 if __name__ == "__main__":
-    from lerobot_roborecover.curation import attrition
+    from lerobot_roborecover.curation import funnel
 
-    attrition.datetime = _StandingClock
+    funnel.datetime = _StandingClock
     os.fsync = lambda number: None  # a kill loses nothing that was written
     module, _, function = sys.argv[1].partition(":")
     print(run(getattr(importlib.import_module(module), function), Path(sys.argv[2]), Path(sys.argv[3])))

@@ -15,15 +15,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover.curation.attrition import Decision, record_decisions
 from lerobot_roborecover.curation.candidates import Candidate, Suggestion
 from lerobot_roborecover.curation.candidates_write import write_candidate_metadata
+from lerobot_roborecover.curation.funnel import Decision, record_decisions
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 from lerobot_roborecover.scenario import Reset, Task
 
 STEPS = 45

@@ -12,10 +12,10 @@ import subprocess
 import sys
 from collections.abc import Mapping
 
-from lerobot_roborecover.env.trial_row import TrialRow
-from lerobot_roborecover.replay import Handoff
-from lerobot_roborecover.rounding import CORE_TYPE, core_type_in_use
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.utils.determinism import CORE_TYPE, core_type_in_use
 
 PINNED = core_type_in_use() == CORE_TYPE
 """This machine rounds as the one that recorded."""
@@ -25,7 +25,7 @@ ROUNDING_MM = {"metaworld": 1e-4, "libero": 0.01, "lerobot_pusht": 0.0, "fake": 
 _PROGRAM = """
 import json, sys
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.replay import hand_off
+from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.platforms import make_simulator
 name, ids = sys.argv[1], json.loads(sys.argv[2])
 scenarios = {s.id: s for s in load_scenarios(name)}

@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay import with_fingerprint
+from lerobot_roborecover.replay.handoff import with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Task
 
 CELLS = [("Approach", "Wrong Pose"), ("Place", "Wrong Target"), ("Move", "Wrong Pose")]

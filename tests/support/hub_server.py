@@ -44,7 +44,7 @@ class Repo:
 
 
 @dataclass
-class Hold:
+class HeldInput:
     """A request that waits, so that a test can act while the client is in the middle of it."""
 
     method: str
@@ -77,14 +77,14 @@ class HubServer(ThreadingHTTPServer):
         """Repository paths whose download ends half way."""
         self.part_bytes: int | None = None
         """Files larger than this are uploaded in parts of this size."""
-        self.holds: list[Hold] = []
+        self.holds: list[HeldInput] = []
         self.failures: list[list] = []
         """[method, pattern of the path, status, how often]: answered so instead; status 0 drops the
         connection with the request half read."""
 
-    def hold(self, method: str, pattern: str, skip: int = 0) -> Hold:
+    def hold(self, method: str, pattern: str, skip: int = 0) -> HeldInput:
         """Lets the next request of a kind, after `skip` others, wait unanswered until it is released."""
-        self.holds.append(Hold(method, pattern, skip))
+        self.holds.append(HeldInput(method, pattern, skip))
         return self.holds[-1]
 
     @property

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.env.facts import RunFacts
-from lerobot_roborecover.env.intervention_options import InterventionFacts
-from lerobot_roborecover.env.options import RecoveryOptions
-from lerobot_roborecover.env.run import PlatformPart
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow
-from lerobot_roborecover.env.vector_env import create_recovery_envs
+from lerobot_roborecover.evaluation.options import RecoveryOptions
+from lerobot_roborecover.evaluation.session import SimulatorSpec
+from lerobot_roborecover.evaluation.vector_env import create_recovery_envs
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.policies.interventions.options import InterventionFacts
+from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.workers.messages import SlotConfig
 
 
@@ -49,7 +49,7 @@ def evaluate(
     n_known: bool = True,
     platform: str = "fake",
     simulator: dict | None = None,
-    spec: PlatformPart | None = None,
+    spec: SimulatorSpec | None = None,
     rollback_steps: int = 0,
     **options,
 ) -> list[TrialRow]:
@@ -57,10 +57,10 @@ def evaluate(
     rolls_back = InterventionFacts("reversion", rollback_steps, {"base": "push"}) if rollback_steps else None
     envs = create_recovery_envs(
         RecoveryOptions(scenarios=str(dataset), trial_log=str(log), **options),
-        spec or PlatformPart(SlotConfig(platform, simulator or {}), {}, None),
+        spec or SimulatorSpec(SlotConfig(platform, simulator or {}), {}, None),
         n_envs=batch,
         workers=workers,
-        facts=RunFacts(policy="push", n_episodes=trials if n_known else None, intervention=rolls_back),
+        facts=PolicyMetadata(policy="push", n_episodes=trials if n_known else None, intervention=rolls_back),
     )
     flat = [env for group in envs.values() for env in group.values()]
     done_batches = 0

@@ -31,19 +31,21 @@ def our_options() -> dict[str, Options]:
 
 def lerobots_options() -> dict[str, Options]:
     """By command, or by what is chosen: options of ours that LeRobot's parser reads, not LeRobot's own."""
-    from lerobot_roborecover.env.configs import ENV_TYPES
-    from lerobot_roborecover.env.options import RecoveryOptions
-    from lerobot_roborecover.interventions import ema
-    from lerobot_roborecover.interventions.configuration_intervention import RoboRecoverInterventionConfig
-    from lerobot_roborecover.interventions.monitor import (
+    from lerobot_roborecover.evaluation.check_policy import SHORT, CheckOptions
+    from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
+    from lerobot_roborecover.evaluation.options import RecoveryOptions
+    from lerobot_roborecover.evaluation.runner import ALIASES, RunnerOptions
+    from lerobot_roborecover.platforms.base import ENV_PREFIX
+    from lerobot_roborecover.policies import ema
+    from lerobot_roborecover.policies.detectors.monitor import (
         configuration_roborecover_monitor,
         configuration_roborecover_monitor_small,
     )
-    from lerobot_roborecover.platforms.base import ENV_PREFIX
-    from lerobot_roborecover.remote.configuration_remote import RemoteConfig
-    from lerobot_roborecover.remote.serve import ServeConfig
-    from lerobot_roborecover.trials.check_policy import SHORT, CheckOptions
-    from lerobot_roborecover.trials.runner import ALIASES, RunnerOptions
+    from lerobot_roborecover.policies.interventions.configuration_intervention import (
+        RoboRecoverInterventionConfig,
+    )
+    from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+    from lerobot_roborecover.policies.remote.serve import ServeConfig
 
     short = {f"--{name}": {"stands_for": f"--{long}"} for name, long in ALIASES.items()}
     check = {name: {"stands_for": long} for name, long in SHORT.items()}

@@ -15,7 +15,7 @@ from typing import Any
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import save_policy
 from tests.support.known_lerobot import count_as_known
 
@@ -24,7 +24,7 @@ TRIALS = 1
 
 
 @dataclass(frozen=True)
-class Chain:
+class Pipeline:
     """What differs from platform to platform."""
 
     env: str
@@ -39,16 +39,16 @@ class Chain:
 
 
 CHAINS = {
-    "crane": Chain(
+    "crane": Pipeline(
         "roborecover_crane", (), ("--expert", "hurried", "--task", "harbour", "--seeds", "0-1"),
         {"state": 4, "env_state": 1, "action": 1},
     ),
-    "pusht": Chain(
+    "pusht": Pipeline(
         "roborecover_lerobot", ("base.type=pusht", "obs_type=state"),
         ("--expert", "expert_biased", "--perturb", "--task", "pusht", "--seeds", "0-3"),
         {"state": 2, "env_state": 16, "action": 2}, 40,
     ),
-    "aloha": Chain(
+    "aloha": Pipeline(
         "roborecover_lerobot", ("base.type=aloha", "base.task=AlohaTransferCube-v0"),
         ("--expert", "expert_biased", "--perturb", "--task", "*Transfer*", "--seeds", "0-3"),
         {"state": 14, "env_state": 0, "action": 14, "images": ("observation.images.top",)}, 40,
@@ -62,7 +62,7 @@ def outcomes(folder: Path) -> list[tuple[str, str, int]]:
     return sorted((row.scenario_id, str(row.outcome), row.steps) for row in rows)
 
 
-def run(root: Path, chain: Chain) -> dict:
+def run(root: Path, chain: Pipeline) -> dict:
     """Collects, labels, screens, validates, divides, evaluates in both ways, and reports."""
     options = [f"--env.{option}" for option in chain.options]
     assert main([

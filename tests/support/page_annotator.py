@@ -6,10 +6,10 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lerobot_roborecover.curation.annotation.annotators import Eye
+from lerobot_roborecover.curation.annotation.annotators import LabelerThresholds
 from lerobot_roborecover.curation.annotation.automatic import verdict_on
+from lerobot_roborecover.curation.annotation.features import EpisodeFeatures, EpisodeInfo, Reading
 from lerobot_roborecover.curation.annotation.guide import STAGES, TYPES
-from lerobot_roborecover.curation.annotation.looking import Look, Reading, Sheet
 from lerobot_roborecover.curation.annotation.rules import Verdict
 from lerobot_roborecover.curation.annotation.votes import DISCARD_REASONS
 
@@ -48,9 +48,9 @@ class PageAnnotator:
         eye: how it looks.
     """
 
-    def __init__(self, page: Any, eye: Eye):
+    def __init__(self, page: Any, eye: LabelerThresholds):
         self._page, self._eye, self._at = page, eye, 0
-        self.looks: list[Look] = []
+        self.looks: list[EpisodeFeatures] = []
         """What it has read, by episode; these go by the page's names."""
 
     def annotate_all(self) -> None:
@@ -60,12 +60,12 @@ class PageAnnotator:
         said = self._page.evaluate(_SHEET)
         for _ in range(int(said["total"]) - int(said["done"])):
             sheet = self._opened(before)
-            self.looks.append(Look(sheet))
+            self.looks.append(EpisodeFeatures(sheet))
             self._enter(verdict_on(sheet, self._read, self._eye))
             before = sheet.candidate
         self._wait(_SAVED)
 
-    def _opened(self, before: str) -> Sheet:
+    def _opened(self, before: str) -> EpisodeInfo:
         self._wait(_OPENED, before)
         self._press("End")
         self._wait(_AT_END)
@@ -75,7 +75,7 @@ class PageAnnotator:
         self._at = 0
         solved = "ends solved" in said["about"]
         fps = last / seconds if seconds else 1.0
-        return Sheet(said["id"], said["instruction"], last, fps, solved, said["human"])
+        return EpisodeInfo(said["id"], said["instruction"], last, fps, solved, said["human"])
 
     def _enter(self, verdict: Verdict) -> None:
         if verdict.discard == "temporary":

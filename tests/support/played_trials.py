@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
-from lerobot_roborecover.env.trial import actions_digest
-from lerobot_roborecover.env.trial_row import Protocol, make_row
+from lerobot_roborecover.logs.actions import actions_digest
+from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.platforms import make_simulator, platform_named
-from lerobot_roborecover.platforms.walk import advance
-from lerobot_roborecover.replay import Handoff
+from lerobot_roborecover.platforms.stepping import advance
+from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 
@@ -38,7 +38,7 @@ def played_trial(scenario: Scenario, start: str, *, expert: bool, run_seed: int 
         simulator.step(taken[-1])
     handoff = Handoff(first, 0.0, False, "", None, None, None, None)
     row = make_row(
-        scenario, Protocol(start, 0, "played", run_seed, None), dataset="played", dataset_revision=None,
+        scenario, EvalProtocol(start, 0, "played", run_seed, None), dataset="played", dataset_revision=None,
         trial=0, noise="per_trial", batch_size=1,
         outcome=Outcome.SUCCESS if simulator.succeeded() else Outcome.HORIZON, reason="", steps=len(taken),
         handoff=handoff, sim_s=0.0, policy_s=0.0, actions_sha256=actions_digest(np.asarray(taken)),

@@ -16,8 +16,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from lerobot_roborecover.remote.connection import RemoteServer, Request, ServerOptions
-from lerobot_roborecover.remote.protocol import pack, unpack
+from lerobot_roborecover.policies.remote.connection import RemoteServer, Request, ServerOptions
+from lerobot_roborecover.policies.remote.protocol import pack, unpack
 from tests.support.processes import PATIENCE_S
 
 OPENPI_CLIENT = "openpi-client==0.1.2"
@@ -88,7 +88,7 @@ def serving(policy: Any, **options: Any) -> Iterator[tuple[str, Any]]:
     """A `PolicyServer` in a thread: its address, and itself."""
     import asyncio
 
-    from lerobot_roborecover.remote.server import PolicyServer, ServeOptions
+    from lerobot_roborecover.policies.remote.server import PolicyServer, ServeOptions
 
     server = PolicyServer(policy, "test", ServeOptions(port=0, **options))
     loop, up = asyncio.new_event_loop(), threading.Event()

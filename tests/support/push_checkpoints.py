@@ -6,8 +6,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from tests.evaluation.test_local_engine import PushHost
 from tests.support.factories import save_policy
-from tests.trials.test_local_engine import PushHost
 
 NOISE = {"still": 0.0, "calm": 1.0, "wild": 3.0}
 """Spread of the noise on each action by the checkpoint's name."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.env.trial_log import read_trial_log
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.policy_servers import OpenpiServer, openpi_client, serving  # noqa: F401 - a fixture
 
@@ -35,7 +35,7 @@ def checkpoints(tmp_path_factory):
 def load(checkpoints, kind, max_batch=64, **changes):
     from lerobot.configs.policies import PreTrainedConfig
 
-    from lerobot_roborecover.remote.serve import load_served
+    from lerobot_roborecover.policies.remote.serve import load_served
 
     config = PreTrainedConfig.from_pretrained(checkpoints[kind])
     config.pretrained_path = checkpoints[kind]

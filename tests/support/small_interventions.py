@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_roborecover.interventions.monitor_interface import Verdicts
-from lerobot_roborecover.policies.host import PolicyError
+from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
+from lerobot_roborecover.policies.runner import PolicyError
 
 if TYPE_CHECKING:
     import torch

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from lerobot_roborecover.studio.teleop.client import Client
+from lerobot_roborecover.web.teleop.client import Client
 from tests.support.processes import PATIENCE_S
 
 GOAL = np.array([-0.3, 0.0])

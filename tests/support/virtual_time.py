@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.replay import Handoff
+from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart
 
 

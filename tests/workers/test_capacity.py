@@ -11,7 +11,7 @@ import pytest
 from lerobot_roborecover.workers.capacity import available_gb, cpu_quota, usable_cores
 
 GIB = 2**30
-HERE = len(os.sched_getaffinity(0))
+LOCAL = len(os.sched_getaffinity(0))
 
 
 def machine(root: Path, files: dict[str, object]) -> Path:
@@ -22,9 +22,9 @@ def machine(root: Path, files: dict[str, object]) -> Path:
 
 
 def test_without_control_groups_the_machine_counts(tmp_path):
-    assert (usable_cores(tmp_path), available_gb(tmp_path)) == (HERE, math.inf)
+    assert (usable_cores(tmp_path), available_gb(tmp_path)) == (LOCAL, math.inf)
     root = machine(tmp_path, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cgroup.procs": ""})
-    assert (usable_cores(root), available_gb(root)) == (HERE, 8.0)
+    assert (usable_cores(root), available_gb(root)) == (LOCAL, 8.0)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_without_control_groups_the_machine_counts(tmp_path):
 def test_the_tightest_limit_holds(tmp_path, files):
     root = machine(tmp_path, files)
     assert cpu_quota(root) == 1.5
-    assert usable_cores(root) == min(2, HERE), "a part of a core is used, too"
+    assert usable_cores(root) == min(2, LOCAL), "a part of a core is used, too"
     assert available_gb(root) == 3.0
 
 
@@ -78,11 +78,11 @@ def test_version_1_without_limits(tmp_path):
         },
     )
     assert cpu_quota(root) == math.inf
-    assert (usable_cores(root), available_gb(root)) == (HERE, 8.0)
+    assert (usable_cores(root), available_gb(root)) == (LOCAL, 8.0)
 
 
 def test_here():
-    assert 1 <= usable_cores() <= HERE
+    assert 1 <= usable_cores() <= LOCAL
     assert available_gb() > 0
 
 

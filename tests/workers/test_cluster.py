@@ -11,14 +11,14 @@ import pytest
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.workers.backend import Backend, WorkerStartup
 from lerobot_roborecover.workers.jobs import Done, JobPool
-from lerobot_roborecover.workers.workplace import Opening, Workplace
 from tests.support.ray_cluster import two_nodes
 from tests.workers.test_jobs import squared, work
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.nightly]
 
-RAY = Workplace("ray")
+RAY = Backend("ray")
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,9 @@ def sleepy(number):
 def test_the_same_results_as_here_and_the_same_refusals(cluster):
     cluster.complete()
     with JobPool("fake", workplace=RAY) as pool:
-        assert list(pool.in_order(squared, range(7))) == [n**2 for n in range(7)]
+        assert list(pool.map_ordered(squared, range(7))) == [n**2 for n in range(7)]
         assert dict(pool.run(squared, iter(range(5)), lambda n: (n, 2))) == {n: 2 * n**2 for n in range(5)}
-        assert list(pool.in_order(squared, [])) == []
+        assert list(pool.map_ordered(squared, [])) == []
         with pytest.raises(ScenarioError, match="the limit is 2"):
             pool.call(work, "refuses")
         with pytest.raises(SimulatorError, match="a worker process died"):
@@ -84,7 +84,7 @@ def test_a_lost_node_costs_nothing_but_time(cluster):
     cluster.complete()
     found, lost = [], cluster.lost
     with JobPool(workplace=RAY) as pool:
-        for value in pool.in_order(sleepy, range(20)):
+        for value in pool.map_ordered(sleepy, range(20)):
             found.append(value)
             if len(found) == 3:
                 cluster.lose_a_node()
@@ -112,7 +112,7 @@ def test_a_cluster_that_cannot_do_the_work_is_refused(cluster, monkeypatch):
     ):
         pool.call(work, "a")
     pool = SlotPool(SlotConfig("fake"), workers=True, timeout_s=60)
-    RAY.settle(pool, 1, 1, Opening(no_device))
+    RAY.settle(pool, 1, 1, WorkerStartup(no_device))
     with pytest.raises(OptionError, match=r"node [0-9.]+ .*cannot begin: simulator 0 has nothing to draw on"):
         pool.ask("fingerprint")
     pool.close()

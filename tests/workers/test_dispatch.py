@@ -7,9 +7,9 @@ from collections import Counter
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.workers.dispatch import each, in_order
-from lerobot_roborecover.workers.messages import More, SlotFailure
-from lerobot_roborecover.workers.slots import MOST_LOSSES
+from lerobot_roborecover.workers.dispatch import map_ordered, map_unordered
+from lerobot_roborecover.workers.messages import InProgress, SlotFailure
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS
 
 
 class FragileSlot:
@@ -52,7 +52,7 @@ class FragileSlot:
         if fate == "lost":
             self._left = self._takes
             return SlotFailure("lost", "the node is gone")
-        return {"done": self._argument, "more": More(), "died": SlotFailure("died", "it died")}[fate]
+        return {"done": self._argument, "more": InProgress(), "died": SlotFailure("died", "it died")}[fate]
 
     def end(self):
         self.ended += 1
@@ -73,16 +73,18 @@ def test_every_item_ends_once_and_is_lost_no_more_often_than_that(openings, fate
     counts: Counter[int] = Counter()
     left = iter(range(count))
     found = list(
-        each(slots_of(openings, fates, counts), "run", lambda *_: next(left, None), lambda item: item)
+        map_unordered(
+            slots_of(openings, fates, counts), "run", lambda *_: next(left, None), lambda item: item
+        )
     )
     assert sorted(item for item, _ in found) == list(range(count))
-    assert all(n <= MOST_LOSSES for n in counts.values())
+    assert all(n <= MAX_ATTEMPTS for n in counts.values())
     for item, reply in found:
         if reply == item:
             continue
         assert isinstance(reply, SlotFailure)
         if reply.kind == "lost":
-            assert counts[item] == MOST_LOSSES
+            assert counts[item] == MAX_ATTEMPTS
             assert reply.message == "lost 3 times, last: the node is gone"
 
 
@@ -98,9 +100,9 @@ def test_the_order_stays_whatever_is_lost(openings, losses, count):
     given_out: Counter[int] = Counter()
     slots = slots_of(openings, fates, given_out)
     items = range(100, 100 + count)
-    for item, reply in zip(items, in_order(slots, "run", items, lambda n: n), strict=True):
+    for item, reply in zip(items, map_ordered(slots, "run", items, lambda n: n), strict=True):
         if isinstance(reply, SlotFailure):  # one item may have drawn every loss
-            assert (reply.kind, given_out[item]) == ("lost", MOST_LOSSES)
+            assert (reply.kind, given_out[item]) == ("lost", MAX_ATTEMPTS)
         else:
             assert reply == item
 
@@ -109,7 +111,7 @@ def test_what_died_by_itself_is_not_tried_again():
     counts: Counter[int] = Counter()
     left = iter(range(3))
     (slot,) = slots_of([0], ["done", "died", "done"], counts)
-    found = dict(each([slot], "run", lambda *_: next(left, None), lambda item: item, fresh=True))
+    found = dict(map_unordered([slot], "run", lambda *_: next(left, None), lambda item: item, fresh=True))
     assert found == {0: 0, 1: SlotFailure("died", "it died"), 2: 2}
     assert set(counts.values()) == {1}
     assert slot.ended == 3, "a fresh process for each"

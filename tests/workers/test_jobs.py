@@ -10,7 +10,7 @@ import pytest
 
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
-from lerobot_roborecover.workers.jobs import Done, JobPool, Raised, simulator_of_worker
+from lerobot_roborecover.workers.jobs import Done, JobError, JobPool, simulator_of_worker
 from lerobot_roborecover.workers.messages import SlotFailure
 from tests.support.processes import alive_after
 
@@ -52,9 +52,9 @@ def heavy():
 
 def test_results_come_in_the_order_of_the_items_and_each_once():
     with JobPool("fake", workers=3) as pool:
-        assert list(pool.in_order(squared, range(7))) == [n**2 for n in range(7)]
+        assert list(pool.map_ordered(squared, range(7))) == [n**2 for n in range(7)]
         assert dict(pool.run(squared, iter(range(5)), lambda n: (n, 2))) == {n: 2 * n**2 for n in range(5)}
-        assert list(pool.in_order(squared, [])) == []
+        assert list(pool.map_ordered(squared, [])) == []
         assert pool.call(heavy) == set()
 
 
@@ -62,7 +62,7 @@ def test_what_goes_wrong_is_that_jobs_own_affair():
     wanted = ["a", "refuses", "breaks", "dies", "b"]
     with JobPool("fake", workers=1) as pool:
         found = dict(pool.outcomes(work, wanted, lambda what: (what,)))
-        assert found["refuses"] == Raised(found["refuses"].error)
+        assert found["refuses"] == JobError(found["refuses"].error)
         assert isinstance(found["refuses"].error, ScenarioError)
         assert found["refuses"].words == "field x: 3; the limit is 2"
         assert found["breaks"].words == "RuntimeError: OwnError: 1 and 2"

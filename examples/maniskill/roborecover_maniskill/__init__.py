@@ -76,7 +76,7 @@ class ManiSkillPlatform(Platform):
         """Square pictures have one size."""
         return {"obs_type": "pixels_agent_pos", "observation_size": size} if size else {"obs_type": "state"}
 
-    def cannot_drive(self, task: Task) -> str:
+    def unsupported_reason(self, task: Task) -> str:
         """The scripted drivers know some tasks."""
         return "" if task.name in PLANS else "it is not scripted"
 

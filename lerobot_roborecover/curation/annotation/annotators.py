@@ -11,7 +11,7 @@ PREFIX = "auto-"
 
 
 @dataclass(frozen=True)
-class Eye:
+class LabelerThresholds:
     """How one annotator looks and where it draws the line; metres and seconds."""
 
     first_look: float = 0.0
@@ -40,13 +40,13 @@ class Eye:
     """How long a deviation has to last."""
 
 
-EYES: Mapping[str, Eye] = {
-    "auto-1": Eye(),
-    "auto-2": Eye(
+LABELERS: Mapping[str, LabelerThresholds] = {
+    "auto-1": LabelerThresholds(),
+    "auto-2": LabelerThresholds(
         first_look=0.3, contact_m=0.09, place_m=0.09, knocked_m=0.035, lost_m=0.045, stuck_m=0.018,
         event_m=0.04,
     ),
-    "auto-3": Eye(
+    "auto-3": LabelerThresholds(
         first_look=0.6, contact_m=0.11, place_m=0.12, knocked_m=0.05, carried_m=0.03, lost_m=0.06,
         stuck_m=0.012, event_m=0.06, stable_s=0.4,
     ),

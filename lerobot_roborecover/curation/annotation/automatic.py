@@ -1,7 +1,7 @@
 """Automatic annotators at work: they apply their rules to the recorded steps, and vote.
 
 They see the numbers that the page prints beside its frames, with its digits: at the page they vote the same
-(`tests/studio/test_automatic_at_the_page.py`). What has a vote already is left out, so that a run that was
+(`tests/web/test_automatic_at_the_page.py`). What has a vote already is left out, so that a run that was
 stopped goes on.
 """
 
@@ -17,12 +17,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.annotation.annotators import EYES, Eye
+from lerobot_roborecover.curation.annotation.annotators import LABELERS, LabelerThresholds
+from lerobot_roborecover.curation.annotation.features import (
+    HAND,
+    EpisodeFeatures,
+    EpisodeInfo,
+    Reading,
+    frames_to_look_at,
+)
 from lerobot_roborecover.curation.annotation.frames import Videos
-from lerobot_roborecover.curation.annotation.looking import HAND, Look, Reading, Sheet, frames_to_look_at
 from lerobot_roborecover.curation.annotation.rules import Verdict, judge
 from lerobot_roborecover.curation.annotation.shown import Shown, shown, take_vote
-from lerobot_roborecover.curation.annotation.votes import VoteBook, VoteError, votes_folder
+from lerobot_roborecover.curation.annotation.votes import VoteError, VoteJournal, votes_folder
 from lerobot_roborecover.curation.candidates import CandidateSet, read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
 from lerobot_roborecover.platforms import platform_named
@@ -39,7 +45,7 @@ def annotate(
     dataset: Path,
     say: Say,
     *,
-    annotators: Sequence[str] = tuple(EYES),
+    annotators: Sequence[str] = tuple(LABELERS),
     votes: Path | None = None,
     only: Path | None = None,
 ) -> None:
@@ -48,7 +54,7 @@ def annotate(
     Args:
         dataset: a candidate dataset.
         say: told the progress.
-        annotators: names of `EYES`.
+        annotators: names of `LABELERS`.
         votes: folder of all votes; by default inside the dataset.
         only: a list of candidates to discuss (`roborecover agree --discuss`).
 
@@ -56,21 +62,21 @@ def annotate(
         ScenarioError: a name is none of them, something cannot be read or written, or an annotator is at work
             elsewhere.
     """
-    unknown = [name for name in annotators if name not in EYES]
+    unknown = [name for name in annotators if name not in LABELERS]
     if unknown:
         raise ScenarioError(
-            f"there is no automatic annotator {unknown[0]!r:.80}; there are {', '.join(EYES)}"
+            f"there is no automatic annotator {unknown[0]!r:.80}; there are {', '.join(LABELERS)}"
         )
     candidates = read_candidates(dataset)
     fps = Videos(dataset, needed=False).fps
     wanted, discussion = to_vote_on(candidates, only)
     folder, number = votes_folder(dataset, votes), discussion.round if discussion else 1
     for name in annotators:
-        with closing(VoteBook(folder, name, number)) as book:
+        with closing(VoteJournal(folder, name, number)) as book:
             _vote_on_all(book, candidates, wanted, fps, say)
 
 
-def _vote_on_all(book: VoteBook, candidates: CandidateSet, wanted: set[str], fps: float, say: Say) -> None:
+def _vote_on_all(book: VoteJournal, candidates: CandidateSet, wanted: set[str], fps: float, say: Say) -> None:
     """One annotator, in the order of the dataset."""
     name, done = book.annotator, book.ballot().votes
     commands = platform_named(candidates.platform).gripper_commands
@@ -81,7 +87,7 @@ def _vote_on_all(book: VoteBook, candidates: CandidateSet, wanted: set[str], fps
         since = time.monotonic()
         episode = shown(candidates, candidates.by_id[candidate], fps)
         sheet = sheet_of(candidate, episode, fps, commands)
-        verdict = verdict_on(sheet, partial(reading, episode), EYES[name])
+        verdict = verdict_on(sheet, partial(reading, episode), LABELERS[name])
         vote = _entered(verdict, episode.first_step)
         seconds = round(time.monotonic() - since)
         try:
@@ -95,7 +101,7 @@ def _vote_on_all(book: VoteBook, candidates: CandidateSet, wanted: set[str], fps
     say(f"{name}: " + (", ".join(f"{n} {what}" for what, n in outcomes.most_common()) or "nothing to do"))
 
 
-def verdict_on(sheet: Sheet, read: Callable[[int], Reading], eye: Eye) -> Verdict:
+def verdict_on(sheet: EpisodeInfo, read: Callable[[int], Reading], eye: LabelerThresholds) -> Verdict:
     """The verdict on an episode: looks along it, then closer before the point, frame by frame.
 
     Args:
@@ -103,7 +109,7 @@ def verdict_on(sheet: Sheet, read: Callable[[int], Reading], eye: Eye) -> Verdic
         read: gives a frame's numbers.
         eye: whose.
     """
-    look = Look(sheet)
+    look = EpisodeFeatures(sheet)
     for frame in frames_to_look_at(eye.first_look, sheet.fps, sheet.last):
         look.readings[frame] = read(frame)
     verdict = judge(look, eye)
@@ -117,7 +123,7 @@ def verdict_on(sheet: Sheet, read: Callable[[int], Reading], eye: Eye) -> Verdic
 
 def sheet_of(
     candidate: str, episode: Shown, fps: float, gripper_commands: tuple[float, float] = (-1.0, 1.0)
-) -> Sheet:
+) -> EpisodeInfo:
     """An episode as a whole. Its rate is that of the times which the page prints.
 
     Args:
@@ -129,7 +135,9 @@ def sheet_of(
     last = episode.steps - 1
     seconds = as_printed(last / fps, TIME_DIGITS)
     rate = last / seconds if seconds else 1.0
-    return Sheet(candidate, episode.instruction, last, rate, episode.solved, episode.human, gripper_commands)
+    return EpisodeInfo(
+        candidate, episode.instruction, last, rate, episode.solved, episode.human, gripper_commands
+    )
 
 
 def reading(episode: Shown, frame: int) -> Reading:

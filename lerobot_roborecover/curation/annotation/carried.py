@@ -13,9 +13,9 @@ from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTE
 from lerobot_roborecover.curation.annotation.votes import VOTES_FOLDER, ballot
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.errors import InUseError
-from lerobot_roborecover.journal import read_journal
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import check_unlocked, write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write, check_unlocked
+from lerobot_roborecover.utils.journal import read_journal
 
 
 def gather_votes(sources: Sequence[Path], root: Path, there: set[str]) -> dict[str, list[dict[str, Any]]]:
@@ -86,7 +86,7 @@ def write_votes(
         except InUseError as err:
             raise ScenarioError(str(err)) from None
         if read_journal(root / path, VOTES_SCHEMA) != list(records):
-            write_whole((folder or root) / path, "".join(json.dumps(r) + "\n" for r in records))
+            atomic_write((folder or root) / path, "".join(json.dumps(r) + "\n" for r in records))
 
 
 def copy_examples(folders: Sequence[Path], root: Path, folder: Path | None = None) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.datasets.files import load_json, read_bytes
-from lerobot_roborecover.outputs import check_new_file
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import check_new_file
 
 SCHEMA_VERSION = 1
 MAX_BYTES = 2**26
@@ -59,7 +59,7 @@ class Discussion:
             "round": self.round,
             "candidates": [{"id": name, **about} for name, about in self.candidates.items()],
         }
-        write_whole(path, json.dumps(document, indent=1) + "\n")
+        atomic_write(path, json.dumps(document, indent=1) + "\n")
 
 
 def _is_discussion(path: Path) -> bool:

@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.annotation.guide import SLUGS, slug
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.platforms.findings import Status
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.workers.parent import ends_with_this
 
 EXAMPLES_FOLDER = "examples"
@@ -102,7 +102,7 @@ def render(platform: str, folder: Path) -> None:
     from PIL import Image
 
     from lerobot_roborecover.platforms import make_simulator
-    from lerobot_roborecover.replay import hand_off
+    from lerobot_roborecover.replay.handoff import hand_off
 
     os.environ.setdefault("MUJOCO_GL", "egl")
     folder.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ def render(platform: str, folder: Path) -> None:
         hand_off(simulator, scenario, check=False)
         buffer = io.BytesIO()
         Image.fromarray(simulator.render()).save(buffer, "JPEG", quality=88)
-        write_whole(path, buffer.getvalue())
+        atomic_write(path, buffer.getvalue())
 
 
 if __name__ == "__main__":

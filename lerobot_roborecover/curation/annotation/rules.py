@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.curation.annotation.annotators import Eye
-from lerobot_roborecover.curation.annotation.looking import HAND, Look
+from lerobot_roborecover.curation.annotation.annotators import LabelerThresholds
+from lerobot_roborecover.curation.annotation.features import HAND, EpisodeFeatures
 from lerobot_roborecover.scenario import DeviationType, Stage
 
 FALLEN_M = 0.3
@@ -42,7 +42,7 @@ class Verdict:
     """Reason; empty where the trajectory is kept."""
 
 
-def judge(look: Look, eye: Eye) -> Verdict:
+def judge(look: EpisodeFeatures, eye: LabelerThresholds) -> Verdict:
     """The verdict on an episode.
 
     Args:
@@ -68,7 +68,7 @@ def judge(look: Look, eye: Eye) -> Verdict:
 class _Seen:
     """Measurements of a look: arrays of n, one value a frame looked at."""
 
-    def __init__(self, look: Look, eye: Eye):
+    def __init__(self, look: EpisodeFeatures, eye: LabelerThresholds):
         self.eye, self.frames, self.seconds = eye, look.frames(), look.seconds()
         self.n = len(self.frames)
         names = look.objects()
@@ -88,7 +88,7 @@ class _Seen:
         self._released = self._releases()
         self.labels = [self._label(i) for i in range(self.n)]
 
-    def _handled(self, look: Look, names: list[str]) -> str:
+    def _handled(self, look: EpisodeFeatures, names: list[str]) -> str:
         """The object with a goal; of several, the one that the hand is nearest to in the end (where a person
         stopped, of a human-made rollout) among those that are not at their place yet; where none has one, the
         one that ends farthest from where it began."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 from lerobot_roborecover.curation.annotation.naming import body_labels, hand_label
 from lerobot_roborecover.curation.annotation.traces import Place, action_labels, traces
-from lerobot_roborecover.curation.annotation.votes import Vote, VoteBook, parse_vote
+from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, parse_vote
 from lerobot_roborecover.curation.candidates import CandidateSet
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 from lerobot_roborecover.scenario import Source
 
 MAX_BODIES_PLOTTED = 4
@@ -88,7 +88,7 @@ def labels_of(steps: Steps) -> dict[str, str]:
     return hands | body_labels(n for n in steps.bodies if n not in hands)
 
 
-def take_vote(book: VoteBook, candidates: CandidateSet, candidate: str, sent: object) -> Vote:
+def take_vote(book: VoteJournal, candidates: CandidateSet, candidate: str, sent: object) -> Vote:
     """Checks a vote and takes it; it is on disk when this returns.
 
     Args:

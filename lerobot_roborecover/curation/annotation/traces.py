@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_roborecover.curation.candidates import Suggestion
 from lerobot_roborecover.platforms import platform_named, platform_names
 from lerobot_roborecover.platforms.simulator import GOAL, GOAL_OF, HANDLE, is_mark
-from lerobot_roborecover.recording import Steps
+from lerobot_roborecover.replay.recorder import Steps
 
 MOVING_M_S = 0.02
 """An object faster than this moves; below lie settling and contact noise."""

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.journal import Journal, read_journal
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
+from lerobot_roborecover.utils.journal import Journal, read_journal
 
 VOTES_FOLDER = "votes"
 SCHEMA_VERSION = 1
@@ -157,7 +157,7 @@ def _encodable(text: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Ballot:
+class CurrentVotes:
     """What an annotator's journal amounts to in one round."""
 
     votes: Mapping[str, Vote]
@@ -170,7 +170,7 @@ class Ballot:
     """uids of the votes that stand, in the order in which they were made."""
 
 
-def ballot(records: Iterable[Mapping[str, Any]], round_number: int | None) -> Ballot:
+def ballot(records: Iterable[Mapping[str, Any]], round_number: int | None) -> CurrentVotes:
     """Folds a journal; of no round where there is no number.
 
     Raises:
@@ -195,7 +195,7 @@ def ballot(records: Iterable[Mapping[str, Any]], round_number: int | None) -> Ba
             raise ScenarioError(
                 f"{dict(record)!r:.200} is not an annotator's record ({err!r:.100})"
             ) from None
-    return Ballot(
+    return CurrentVotes(
         {v.candidate: v for v in standing},
         {v.candidate: v for v in standing if not v.informed},
         frozenset(revealed),
@@ -215,7 +215,7 @@ def _read_vote(record: Mapping[str, Any]) -> Vote:
     return vote
 
 
-class VoteBook:
+class VoteJournal:
     """One annotator's open journal; only one process may hold it. Safe to use from several threads.
 
     Args:
@@ -233,7 +233,7 @@ class VoteBook:
         self._lock = threading.Lock()
         self._ballot = ballot(self._journal.records, round_number)
 
-    def ballot(self) -> Ballot:
+    def ballot(self) -> CurrentVotes:
         """What stands now."""
         return self._ballot
 

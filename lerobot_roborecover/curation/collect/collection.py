@@ -17,24 +17,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_roborecover.curation.attrition import StageCounts, attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.judge import verdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
-from lerobot_roborecover.curation.collect.rollouts import RolloutBook
+from lerobot_roborecover.curation.collect.rollouts import RolloutJournal
 from lerobot_roborecover.curation.collect.run import PARTS_FOLDER, film_and_write, roll_out
 from lerobot_roborecover.curation.collect.settings import claim, differences, driver_of, settings_of
-from lerobot_roborecover.curation.collect.starts import Planned, make_units
+from lerobot_roborecover.curation.collect.starts import RolloutSpec, make_units
 from lerobot_roborecover.curation.collect.write import read_about
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.run import PlatformPart
+from lerobot_roborecover.curation.funnel import StageCounts, attrition_table, count_stages, read_decisions
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.session import SimulatorSpec
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.scenario import ScenarioError, Task
-from lerobot_roborecover.words import counted, next_line
+from lerobot_roborecover.utils.text import next_command, pluralize
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.env.configs import RecoveryEnvConfig
+    from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def collect(options: CollectOptions, say: Callable[[str], None] = print) -> Coll
         return finished
     claim(work, rolled)
     try:
-        book = RolloutBook(work)
+        book = RolloutJournal(work)
     except OSError as err:
         raise ScenarioError(f"{work} cannot be written: {err}") from err
     try:
@@ -97,21 +97,21 @@ def describe(collected: Collected) -> str:
     """The final table, and the command that follows."""
     lines = [attrition_table(collected.rows)] if collected.rows else []
     if collected.out is not None:
-        lines.append(f"\n{counted(collected.candidates, 'candidate')} in {collected.out}")
-        lines.append(next_line(["annotate", str(collected.out), "--annotator", "NAME"]))
+        lines.append(f"\n{pluralize(collected.candidates, 'candidate')} in {collected.out}")
+        lines.append(next_command(["annotate", str(collected.out), "--annotator", "NAME"]))
     else:
         lines.append("\nno rollout was kept, so no dataset was written")
     return "\n".join(lines)
 
 
-def plan(options: CollectOptions, say: Callable[[str], None] = print) -> list[Planned]:
+def plan(options: CollectOptions, say: Callable[[str], None] = print) -> list[RolloutSpec]:
     """The rollouts that `collect` would run; starts nothing. `say` takes lines for people."""
     options.check()
     env, _ = _env(options)
     return _units(options, env, say)
 
 
-def _env(options: CollectOptions) -> tuple[RecoveryEnvConfig, PlatformPart]:
+def _env(options: CollectOptions) -> tuple[RecoveryEnvConfig, SimulatorSpec]:
     """The recovery env config and its part of a run, checked."""
     from lerobot_roborecover.curation.policy_trials import env_config
 
@@ -133,7 +133,7 @@ def _env(options: CollectOptions) -> tuple[RecoveryEnvConfig, PlatformPart]:
     return env, env.run_spec()
 
 
-def _units(options: CollectOptions, env: Any, say: Callable[[str], None]) -> list[Planned]:
+def _units(options: CollectOptions, env: Any, say: Callable[[str], None]) -> list[RolloutSpec]:
     own = platform_named(options.platform)
     tasks = choose_tasks(own.tasks(env.gym_kwargs), options.tasks)
     if options.expert:
@@ -149,7 +149,7 @@ def _drivable(expert: str, tasks: Sequence[Task], say: Callable[[str], None]) ->
     Raises:
         ScenarioError: there is none.
     """
-    why_not = {task: platform_named(task.platform).cannot_drive(task) for task in tasks}
+    why_not = {task: platform_named(task.platform).unsupported_reason(task) for task in tasks}
     able = [task for task, why in why_not.items() if not why]
     left_out = [f"{task.suite}/{task.name} ({why})" for task, why in why_not.items() if why]
     if not able:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.collect.record import Record
 from lerobot_roborecover.platforms.simulator import is_mark
-from lerobot_roborecover.recording import PERTURBED
+from lerobot_roborecover.replay.recorder import PERTURBED
 from lerobot_roborecover.scenario import ScenarioError
 
 ERRATIC_SHARE = 0.35

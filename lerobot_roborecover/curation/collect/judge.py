@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.attrition import Decision
 from lerobot_roborecover.curation.collect.exclusions import Exclusion, judge, objects_of
 from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
-from lerobot_roborecover.curation.collect.rollouts import Ended, RolloutBook
-from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.curation.collect.rollouts import RolloutJournal, RolloutOutcome
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
+from lerobot_roborecover.curation.funnel import Decision
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.recording import PERTURBED, UNREACHABLE
+from lerobot_roborecover.replay.recorder import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Outcome
 
 TOUCHED_TILT_DEG = 15.0
@@ -21,7 +21,7 @@ TOUCHED_TILT_DEG = 15.0
 
 
 @dataclass(frozen=True)
-class Judging:
+class FilterConfig:
     """Options that decide what is kept, not what is rolled out."""
 
     skip: tuple[str, ...] = ()
@@ -37,7 +37,7 @@ class Judging:
 class RolloutVerdict:
     """What becomes of a rollout."""
 
-    planned: Planned
+    planned: RolloutSpec
     dropped: Decision | None
     """Why it is no candidate; None where it is one."""
     exclusion: Exclusion | None = None
@@ -47,7 +47,7 @@ class RolloutVerdict:
 
 
 @dataclass(frozen=True)
-class Touch:
+class SceneDisturbance:
     """The object that ends farthest from its undisturbed path."""
 
     body: str
@@ -55,7 +55,7 @@ class Touch:
     tilted_deg: float
 
 
-def scene_touched(record: Record, twin: Record) -> Touch:
+def scene_touched(record: Record, twin: Record) -> SceneDisturbance:
     """How far the scene ends from every state that the undisturbed rollout had it in.
 
     For each object: the distance of its last position from the nearest on its path in the twin (its start
@@ -67,7 +67,7 @@ def scene_touched(record: Record, twin: Record) -> Touch:
         record: the perturbed rollout.
         twin: same driver, same start, same noise, undisturbed.
     """
-    best, best_score = Touch("", 0.0, 0.0), -1.0
+    best, best_score = SceneDisturbance("", 0.0, 0.0), -1.0
     others = objects_of(twin)
     for name, poses in objects_of(record).items():
         path = others[name][twin.reset.settle_steps :]
@@ -75,7 +75,7 @@ def scene_touched(record: Record, twin: Record) -> Touch:
         cosine = float((_up(path[:, 3:]) @ _up(poses[-1:, 3:])[0]).max())
         tilt = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
         if distance + tilt > best_score:
-            best, best_score = Touch(name, distance, tilt), distance + tilt
+            best, best_score = SceneDisturbance(name, distance, tilt), distance + tilt
     return best
 
 
@@ -85,7 +85,9 @@ def _up(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
-def verdict(planned: Planned, ended: Ended, book: RolloutBook, judging: Judging) -> RolloutVerdict:
+def verdict(
+    planned: RolloutSpec, ended: RolloutOutcome, book: RolloutJournal, judging: FilterConfig
+) -> RolloutVerdict:
     """Judges one finished rollout; the same whenever it is asked.
 
     Args:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.collect.exclusions import check_rules
 from lerobot_roborecover.curation.collect.experts import check_expert
-from lerobot_roborecover.curation.collect.judge import Judging
+from lerobot_roborecover.curation.collect.judge import FilterConfig
 from lerobot_roborecover.curation.collect.starts import Starts
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 
 def parse_side(text: str) -> int:
@@ -54,7 +54,7 @@ class CollectOptions:
     device: str | None = None
     perturb: bool = False
     perturbed_steps: int = PERTURBED_STEPS
-    judging: Judging = field(default_factory=Judging)
+    judging: FilterConfig = field(default_factory=FilterConfig)
     seed: int = 7
     """Of the perturbation, of the policy's noise, and of drivers that draw."""
     horizon: int = 0
@@ -63,7 +63,7 @@ class CollectOptions:
     """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
     """Side of the pictures in pixels; 0 films none."""
-    workplace: Workplace = HERE
+    workplace: Backend = LOCAL
     """Where rollouts are, and replays for the pictures."""
     slots: int = 0
     """Simulators at once; 0 takes one a core, or all CPUs of a cluster that policies leave over."""

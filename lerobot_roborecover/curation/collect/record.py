@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.collect.starts import Planned
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS, perturb_translations
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.limits import Workspace, limits_of
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.starts import stream
-from lerobot_roborecover.recording import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
+from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
 from lerobot_roborecover.scenario import Reset, ScenarioError
 
 
@@ -132,14 +132,14 @@ class RecordingSimulator:
         self._recorder = Recorder(simulator)
         self._settings = settings
         self._limits = limits_of(simulator)
-        self._plan: Planned | None = None
+        self._plan: RolloutSpec | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "inner":  # while it is being made
             raise AttributeError(name)
         return getattr(self.inner, name)
 
-    def plan(self, planned: Planned) -> None:
+    def plan(self, planned: RolloutSpec) -> None:
         """Names the rollout that the next reset begins."""
         self._plan = planned
 

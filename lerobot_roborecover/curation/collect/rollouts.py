@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.collect.record import record_path
-from lerobot_roborecover.curation.collect.server import Driven
-from lerobot_roborecover.curation.collect.starts import Planned
-from lerobot_roborecover.env.run import Run
-from lerobot_roborecover.env.trial import FAILURES, Trial
-from lerobot_roborecover.env.trial_row import Protocol, TrialRow
-from lerobot_roborecover.journal import Journal
+from lerobot_roborecover.curation.collect.server import RolloutResult
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
+from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.evaluation.trial import FAILURES, Trial
+from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue
+from lerobot_roborecover.logs.row import EvalProtocol, TrialRow
 from lerobot_roborecover.scenario import Outcome, ScenarioError
-from lerobot_roborecover.trials.units import Unit, UnitQueue
-from lerobot_roborecover.whole import write_whole
-from lerobot_roborecover.workers.dispatch import each
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.journal import Journal
+from lerobot_roborecover.workers.dispatch import map_unordered
 from lerobot_roborecover.workers.messages import SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool
 
@@ -27,7 +27,7 @@ SCHEMA_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Ended:
+class RolloutOutcome:
     """How one rollout ended."""
 
     rollout: str
@@ -44,7 +44,7 @@ class Ended:
         return Outcome(self.outcome).valid
 
 
-class RolloutBook:
+class RolloutJournal:
     """The journal of a working folder and the records beside it; one process at a time.
 
     Args:
@@ -57,10 +57,10 @@ class RolloutBook:
     def __init__(self, work: Path):
         self.work, self.records = work, work / RECORDS_FOLDER
         self._journal = Journal(work / ROLLOUTS_FILE, SCHEMA_VERSION)
-        self._ended: dict[str, Ended] = {}
+        self._ended: dict[str, RolloutOutcome] = {}
         for row in self._journal.records:
             try:
-                ended = Ended(**{k: v for k, v in row.items() if k != "schema"})
+                ended = RolloutOutcome(**{k: v for k, v in row.items() if k != "schema"})
                 Outcome(ended.outcome)
             except (TypeError, ValueError) as err:
                 self._journal.close()
@@ -69,7 +69,7 @@ class RolloutBook:
                 ) from None
             self._ended[ended.rollout] = ended
 
-    def find(self, rollout: str, *, retry_errors: bool = False) -> Ended | None:
+    def find(self, rollout: str, *, retry_errors: bool = False) -> RolloutOutcome | None:
         """How a rollout ended; None where it is still to be done.
 
         Args:
@@ -83,7 +83,7 @@ class RolloutBook:
             return None
         return ended
 
-    def add(self, ended: Ended, record: bytes) -> None:
+    def add(self, ended: RolloutOutcome, record: bytes) -> None:
         """Writes an end down, its record first, so that no end is without one.
 
         Args:
@@ -91,7 +91,7 @@ class RolloutBook:
             record: content of the record's file; empty where it did not come to its end.
         """
         if record:
-            write_whole(record_path(self.records, ended.rollout), record)
+            atomic_write(record_path(self.records, ended.rollout), record)
         self._journal.append(asdict(ended))
         self._ended[ended.rollout] = ended
 
@@ -100,11 +100,11 @@ class RolloutBook:
         self._journal.close()
 
 
-type OnEnd = Callable[[Ended, bytes], None]
+type OnEnd = Callable[[RolloutOutcome, bytes], None]
 """Told how a rollout ended, with the content of its record's file."""
 
 
-def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnEnd) -> None:
+def run_expert(units: Iterable[RolloutSpec], pool: SlotPool, slots: int, on_end: OnEnd) -> None:
     """Drives rollouts in the workers.
 
     Args:
@@ -113,23 +113,23 @@ def run_expert(units: Iterable[Planned], pool: SlotPool, slots: int, on_end: OnE
         slots: how many.
         on_end: told of each.
     """
-    queue = UnitQueue(Unit(u, u.trial) for u in units)
+    queue = WorkQueue(WorkItem(u, u.trial) for u in units)
 
-    def take(last: Unit | None, busy: list[Unit]) -> Unit | None:
+    def take(last: WorkItem | None, busy: list[WorkItem]) -> WorkItem | None:
         return queue.take(last, [u.task for u in busy])
 
     workers = pool.worker_slots(min(slots, max(len(queue), 1)))
-    for unit, reply in each(workers, "drive", take, lambda u: u.scenario):
+    for unit, reply in map_unordered(workers, "drive", take, lambda u: u.scenario):
         name = unit.scenario.record_name
         if isinstance(reply, SlotFailure):
-            on_end(Ended(name, FAILURES[reply.kind].value, 0, reply.message), b"")
+            on_end(RolloutOutcome(name, FAILURES[reply.kind].value, 0, reply.message), b"")
         else:
-            assert isinstance(reply, Driven)
-            on_end(Ended(name, reply.outcome.value, reply.steps, reply.reason), reply.record)
+            assert isinstance(reply, RolloutResult)
+            on_end(RolloutOutcome(name, reply.outcome.value, reply.steps, reply.reason), reply.record)
 
 
 def run_policy(
-    passes: Iterable[Sequence[Planned]],
+    passes: Iterable[Sequence[RolloutSpec]],
     pool: SlotPool,
     make_host: Callable[[], Any],
     places: Any,
@@ -143,25 +143,27 @@ def run_policy(
             pass have different ids.
         pool: of slots with `collect_server.SERVER`.
         make_host: loads the policy.
-        places: where, `trials.places.EnginePlaces`.
+        places: where, `trials.places.EngineConfig`.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
         on_end: told of each.
 
     Raises:
         ScenarioError: the policy went away, so that some were not driven.
     """
-    from lerobot_roborecover.trials.places import open_engine
+    from lerobot_roborecover.evaluation.launch import open_engine
 
     def keep(trial: Trial, row: TrialRow) -> None:
-        assert isinstance(trial.scenario, Planned)
-        on_end(Ended(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment)
+        assert isinstance(trial.scenario, RolloutSpec)
+        on_end(
+            RolloutOutcome(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment
+        )
 
     for wanted in passes:
         if not wanted:
             continue
-        units = [Unit(u, u.trial) for u in wanted]
-        protocol = Protocol("recovery", 0, wanted[0].driver, seed, None)
-        run = Run(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
+        units = [WorkItem(u, u.trial) for u in wanted]
+        protocol = EvalProtocol("recovery", 0, wanted[0].driver, seed, None)
+        run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
         engine = open_engine(run, units, make_host, places)
         engine.run(units)
         engine.check_all_run()

@@ -10,21 +10,27 @@ from typing import Any
 from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.record import RecorderSettings
-from lerobot_roborecover.curation.collect.rollouts import Ended, OnEnd, RolloutBook, run_expert, run_policy
+from lerobot_roborecover.curation.collect.rollouts import (
+    OnEnd,
+    RolloutJournal,
+    RolloutOutcome,
+    run_expert,
+    run_policy,
+)
 from lerobot_roborecover.curation.collect.server import SERVER
-from lerobot_roborecover.curation.collect.starts import Planned
-from lerobot_roborecover.curation.collect.write import Writing, write_collection
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
+from lerobot_roborecover.curation.collect.write import WriterConfig, write_collection
 from lerobot_roborecover.curation.film import Film
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.run import PlatformPart
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.progress import ProgressLine
+from lerobot_roborecover.evaluation.session import SimulatorSpec
+from lerobot_roborecover.evaluation.sizes import default_slots
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, ScenarioError
-from lerobot_roborecover.trials.progress import ProgressLine
-from lerobot_roborecover.trials.sizes import default_slots
+from lerobot_roborecover.workers.backend import WorkerStartup
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 from lerobot_roborecover.workers.dispatch import failed
 from lerobot_roborecover.workers.slots import SlotPool
-from lerobot_roborecover.workers.workplace import Opening
 
 PARTS_FOLDER = "parts"
 
@@ -46,19 +52,19 @@ class Count:
 
 
 def roll_out(
-    options: CollectOptions, env: Any, spec: PlatformPart, units: Sequence[Planned], book: RolloutBook
+    options: CollectOptions, env: Any, spec: SimulatorSpec, units: Sequence[RolloutSpec], book: RolloutJournal
 ) -> None:
     """Runs what the book does not hold yet; the undisturbed twins last, of those that failed: what succeeded
     is dropped whatever its twin did."""
     wants_twins = bool(options.judging.scene_touched_mm)
 
-    def lacking(wanted: Iterable[Planned]) -> list[Planned]:
+    def lacking(wanted: Iterable[RolloutSpec]) -> list[RolloutSpec]:
         return [u for u in wanted if book.find(u.record_name, retry_errors=options.retry_errors) is None]
 
-    def twins() -> list[Planned]:
+    def twins() -> list[RolloutSpec]:
         return [replace(u, twin=True) for u in units if wants_twins and not _solved(book, u)]
 
-    def passes() -> Iterator[list[Planned]]:
+    def passes() -> Iterator[list[RolloutSpec]]:
         yield lacking(units)
         yield lacking(twins())
 
@@ -70,7 +76,7 @@ def roll_out(
         return
     disturbed = {u.record_name for u in units}
 
-    def on_end(ended: Ended, record: bytes) -> None:
+    def on_end(ended: RolloutOutcome, record: bytes) -> None:
         solved = ended.outcome == Outcome.SUCCESS
         book.add(ended, record)
         progress.done += 1
@@ -97,7 +103,7 @@ def roll_out(
         pool.release()
 
 
-def _solved(book: RolloutBook, unit: Planned) -> bool:
+def _solved(book: RolloutJournal, unit: RolloutSpec) -> bool:
     ended = book.find(unit.record_name)
     return ended is not None and ended.outcome == Outcome.SUCCESS
 
@@ -105,11 +111,11 @@ def _solved(book: RolloutBook, unit: Planned) -> bool:
 def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
     """Has the pool's slots made where the options say, drawing on that machine's own device; how many there
     may be."""
-    opening = Opening()
+    opening = WorkerStartup()
     if draws:
-        from lerobot_roborecover.env.render_device import egl_devices, node_drawing, render_environment
+        from lerobot_roborecover.workers.render_device import egl_devices, node_drawing, render_environment
 
-        opening = Opening(partial(node_drawing, "auto"))
+        opening = WorkerStartup(partial(node_drawing, "auto"))
         if not options.workplace.on_cluster:
             pool.configure(environment=render_environment("auto", options.device or "cpu", egl_devices()))
     return options.workplace.settle(
@@ -120,30 +126,30 @@ def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
 def _run_policy(
     options: CollectOptions,
     env: Any,
-    passes: Iterable[Sequence[Planned]],
+    passes: Iterable[Sequence[RolloutSpec]],
     pool: SlotPool,
     draws: bool,
     on_end: OnEnd,
 ) -> None:
-    from lerobot_roborecover.env.intervention_options import POLICY_TYPE
-    from lerobot_roborecover.trials import load
-    from lerobot_roborecover.trials.places import EnginePlaces
+    from lerobot_roborecover.evaluation import loading
+    from lerobot_roborecover.evaluation.launch import EngineConfig
+    from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
 
-    config = load.policy_config(options.policy, options.policy_options, options.device)
+    config = loading.policy_config(options.policy, options.policy_options, options.device)
     if config.type == POLICY_TYPE:
         raise OptionError(
             f"--policy.path={options.policy}: an intervention goes back in time and cannot be replayed as "
             "one rollout; collect from its base policy"
         )
-    spec = load.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
-    places = EnginePlaces(options.workplace, options.slots, options.replicas, str(config.device), draws)
-    run_policy(passes, pool, partial(load.load_host, spec), places, options.seed, on_end)
+    spec = loading.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
+    places = EngineConfig(options.workplace, options.slots, options.replicas, str(config.device), draws)
+    run_policy(passes, pool, partial(loading.load_host, spec), places, options.seed, on_end)
 
 
 def film_and_write(
     options: CollectOptions,
-    spec: PlatformPart,
-    book: RolloutBook,
+    spec: SimulatorSpec,
+    book: RolloutJournal,
     kept: Sequence[RolloutVerdict],
     dropped: Sequence[Any],
     about: Mapping[str, Any],
@@ -172,7 +178,7 @@ def film_and_write(
         versions = pool.ask("fingerprint")
         if not isinstance(versions, dict):
             raise ScenarioError(f"no simulator could be made to film with: {failed(versions)}")
-        writing = Writing(
+        writing = WriterConfig(
             records=book.records,
             parts=book.work / PARTS_FOLDER,
             pool=pool,
@@ -201,6 +207,6 @@ def film_and_write(
         pool.release()
 
 
-def _film_options(options: CollectOptions, spec: PlatformPart) -> dict[str, Any]:
+def _film_options(options: CollectOptions, spec: SimulatorSpec) -> dict[str, Any]:
     """Options of the simulator that films: the policy's own, but for what is seen."""
     return {**spec.slot.options, **platform_named(options.platform).picture_options(options.frames)}

@@ -11,13 +11,13 @@ import numpy as np
 
 from lerobot_roborecover.curation.collect.experts import make_driver
 from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator, pack_record
-from lerobot_roborecover.curation.collect.starts import Planned
-from lerobot_roborecover.env.slot_server import SlotServer
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.platforms import Observation, Simulator
 from lerobot_roborecover.platforms.starts import stream
-from lerobot_roborecover.platforms.walk import advance, walk
+from lerobot_roborecover.platforms.stepping import advance, iter_steps
 from lerobot_roborecover.scenario import Outcome, Rollout, TrialStart
-from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, More, SlotConfig
+from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, InProgress, SlotConfig
+from lerobot_roborecover.workers.slot_server import SlotServer
 
 SERVER = f"{__name__}:CollectServer"
 REPLY_EVERY_S = 5.0
@@ -25,7 +25,7 @@ REPLY_EVERY_S = 5.0
 
 
 @dataclass(frozen=True)
-class Driven:
+class RolloutResult:
     """Reply to `drive`: how a scripted rollout ended."""
 
     outcome: Outcome
@@ -69,7 +69,7 @@ class CollectServer(SlotServer):
         super().__init__(config)
         self._settings = RecorderSettings(**config.settings) if config.settings else None
         self._recording: RecordingSimulator | None = None
-        self._under_way: Iterator[Driven | Filmed | None] = iter(())
+        self._under_way: Iterator[RolloutResult | Filmed | None] = iter(())
         if self._settings is not None:
             self._recording = RecordingSimulator(self._simulator, self._settings)
             self._simulator = cast(Simulator, self._recording)  # by delegation
@@ -78,7 +78,7 @@ class CollectServer(SlotServer):
         """`drive` and `film` beside the usual commands."""
         if command not in ("drive", "film"):
             return super().answer(command, argument)
-        if isinstance(argument, Planned):
+        if isinstance(argument, RolloutSpec):
             self._under_way = self._drive(argument)
         elif isinstance(argument, FilmJob):
             self._under_way = self._film(argument)
@@ -89,16 +89,16 @@ class CollectServer(SlotServer):
                 return result
             if time.monotonic() - began > REPLY_EVERY_S:
                 break
-        return More()
+        return InProgress()
 
     def _reset(self, spec: EpisodeSpec) -> EpisodeStart:
         if self._recording is not None:
-            assert isinstance(spec.scenario, Planned)
+            assert isinstance(spec.scenario, RolloutSpec)
             self._recording.plan(spec.scenario)
         return super()._reset(spec)
 
     def _smoke(self, scenario: TrialStart) -> np.ndarray | None:
-        if self._recording is not None and isinstance(scenario, Planned):
+        if self._recording is not None and isinstance(scenario, RolloutSpec):
             self._recording.plan(scenario)
         return super()._smoke(scenario)
 
@@ -108,7 +108,7 @@ class CollectServer(SlotServer):
             return result
         return replace(result, attachment=pack_record(self._recording.record()))
 
-    def _drive(self, planned: Planned) -> Iterator[Driven | None]:
+    def _drive(self, planned: RolloutSpec) -> Iterator[RolloutResult | None]:
         """A rollout; yields None after each step, and at last how it ended."""
         assert self._recording is not None
         assert self._settings is not None
@@ -117,20 +117,22 @@ class CollectServer(SlotServer):
         simulator.reset(task, reset)
         advance(simulator, planned.prefix)
         if simulator.succeeded():
-            yield Driven(Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action")
+            yield RolloutResult(
+                Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action"
+            )
             return
         rng = stream(self._settings.seed, "driver", task, reset, planned.trial)
         act = make_driver(self._settings.expert, simulator.inner, task, rng)
         for t in range(task.horizon):
             action = np.asarray(act(t), dtype=np.float64)
             if not np.isfinite(action).all():
-                yield Driven(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+                yield RolloutResult(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
                 return
             simulator.step(action)
             if simulator.over:
                 solved = simulator.succeeded()
                 outcome = Outcome.SUCCESS if solved else Outcome.HORIZON
-                yield Driven(outcome, t + 1, record=pack_record(simulator.record()))
+                yield RolloutResult(outcome, t + 1, record=pack_record(simulator.record()))
                 return
             yield None
 
@@ -138,7 +140,7 @@ class CollectServer(SlotServer):
         """A replay; yields None after each step, and at last what was seen."""
         simulator, seen, error = self._simulator, [], 0.0
         steps = len(job.rollout)
-        for t in walk(simulator, job.rollout):
+        for t in iter_steps(simulator, job.rollout):
             now = simulator.bodies()
             places = np.array([now[name].position_m for name in job.bodies])
             error = max(error, float(np.linalg.norm(places - job.poses[:, t, :3], axis=1).max()))

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.collect.options import CollectOptions
-from lerobot_roborecover.curation.collect.starts import Planned
-from lerobot_roborecover.env.facts import RunFacts, facts_of
-from lerobot_roborecover.env.run import PlatformPart
+from lerobot_roborecover.curation.collect.starts import RolloutSpec
+from lerobot_roborecover.evaluation.session import SimulatorSpec
+from lerobot_roborecover.policies.metadata import PolicyMetadata, policy_metadata
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 SETTINGS_FILE = "collect.json"
 
@@ -24,23 +24,23 @@ def driver_of(options: CollectOptions) -> str:
         return options.name
     if options.expert:
         return options.expert
-    from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.policies.identity import policy_identity
 
     return policy_identity(options.policy)
 
 
-def _policy_facts(options: CollectOptions) -> RunFacts | None:
+def _policy_facts(options: CollectOptions) -> PolicyMetadata | None:
     """Who the policy is, by its files and options; None for an expert."""
     if not options.policy:
         return None
-    from lerobot_roborecover.trials.load import policy_config
+    from lerobot_roborecover.evaluation.loading import policy_config
 
     config = policy_config(options.policy, options.policy_options, options.device)
-    return facts_of(config, rename_map=options.rename_map)
+    return policy_metadata(config, rename_map=options.rename_map)
 
 
 def settings_of(
-    options: CollectOptions, spec: PlatformPart, units: Sequence[Planned]
+    options: CollectOptions, spec: SimulatorSpec, units: Sequence[RolloutSpec]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What decides the rollouts, and what decides the dataset."""
     policy = _policy_facts(options)
@@ -94,7 +94,7 @@ def claim(work: Path, rolled: Mapping[str, Any]) -> None:
                     "--out, or another --work"
                 )
             return
-        write_whole(path, json.dumps(rolled, indent=2) + "\n")
+        atomic_write(path, json.dumps(rolled, indent=2) + "\n")
     except (OSError, ValueError) as err:
         if isinstance(err, ScenarioError):
             raise

@@ -19,7 +19,7 @@ _NAME_PART = 56
 
 
 @dataclass(frozen=True)
-class Planned(TrialStart):
+class RolloutSpec(TrialStart):
     """A rollout to be made, from a task's first state: its prefix is nothing but the settling actions."""
 
     driver: str
@@ -77,7 +77,7 @@ def parse_numbers(text: str, option: str) -> tuple[int, ...]:
 
 def make_units(
     tasks: Sequence[Task], starts: Starts, driver: str, settle_action: np.ndarray, *, perturbed: bool
-) -> list[Planned]:
+) -> list[RolloutSpec]:
     """One plan a rollout, task by task.
 
     Args:
@@ -90,7 +90,7 @@ def make_units(
     Raises:
         ScenarioError: there are too many, or two have the same id.
     """
-    made: dict[str, Planned] = {}
+    made: dict[str, RolloutSpec] = {}
     for task in tasks:
         for reset in platform_named(task.platform).resets(task, starts):
             for trial in range(starts.trials):
@@ -98,7 +98,7 @@ def make_units(
                 if id_ in made:
                     raise ScenarioError(f"two rollouts would have the id {id_!r}; collect those tasks apart")
                 settling = np.tile(np.asarray(settle_action, np.float64), (reset.settle_steps, 1))
-                made[id_] = Planned(id_, task, reset, settling, driver, trial, perturbed)
+                made[id_] = RolloutSpec(id_, task, reset, settling, driver, trial, perturbed)
         if len(made) > MAX_STARTS:
             raise ScenarioError(f"more than {MAX_STARTS} rollouts; collect in several folders")
     return list(made.values())

@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover import __version__
-from lerobot_roborecover.curation.attrition import Decision, record_decisions
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.curation.candidates import Candidate, read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
 from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
 from lerobot_roborecover.curation.collect.server import Filmed, FilmJob
 from lerobot_roborecover.curation.film import Film
+from lerobot_roborecover.curation.funnel import Decision, record_decisions
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Rollout, ScenarioError
-from lerobot_roborecover.whole import new_folder, write_whole
-from lerobot_roborecover.workers.dispatch import failed, in_order
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
+from lerobot_roborecover.workers.dispatch import failed, map_ordered
 from lerobot_roborecover.workers.slots import SlotPool
 
 COLLECT_FILE = "collect.json"
@@ -37,7 +37,7 @@ SCHEMA_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Writing:
+class WriterConfig:
     """How a collection is written."""
 
     records: Path
@@ -64,7 +64,7 @@ def write_collection(
     out: Path,
     kept: Sequence[RolloutVerdict],
     dropped: Iterable[Decision],
-    writing: Writing,
+    writing: WriterConfig,
     about: Mapping[str, Any],
     on_film: Callable[[int], None] = lambda done: None,
 ) -> Path:
@@ -106,7 +106,7 @@ def write_collection(
             f"none of the {len(kept)} candidates could be filmed, so {out} is not written. The first: "
             f"{lost[0].reason}: {lost[0].detail}"
         )
-    with new_folder(out) as whole:
+    with atomic_dir(out) as whole:
         merge_candidates(whole, parts)
         record_decisions(whole, [*dropped, *lost])
         document = {"schema_version": SCHEMA_VERSION, "written_by": {"lerobot_env_roborecover": __version__}}
@@ -138,7 +138,7 @@ class _NothingLeft(Exception):
 
 
 def _write_part(
-    part: Path, chunk: Sequence[RolloutVerdict], writing: Writing, on_film: Callable[[int], None]
+    part: Path, chunk: Sequence[RolloutVerdict], writing: WriterConfig, on_film: Callable[[int], None]
 ) -> None:
     lost: dict[str, tuple[str, str]] = {}
     films = _films(chunk, writing, lost)
@@ -168,7 +168,7 @@ def _write_part(
 
 
 def _films(
-    chunk: Sequence[RolloutVerdict], writing: Writing, lost: dict[str, tuple[str, str]]
+    chunk: Sequence[RolloutVerdict], writing: WriterConfig, lost: dict[str, tuple[str, str]]
 ) -> Iterator[Recording]:
     """Recordings of a part, as they are filmed; notes those that are lost, and why."""
 
@@ -184,7 +184,7 @@ def _films(
         )
 
     workers = writing.pool.worker_slots(min(writing.slots, len(chunk)))
-    for v, film in zip(chunk, in_order(workers, "film", chunk, job), strict=True):
+    for v, film in zip(chunk, map_ordered(workers, "film", chunk, job), strict=True):
         if failed(film):
             lost[v.planned.id] = "could not be replayed", failed(film)[:500]
             continue
@@ -230,7 +230,7 @@ def _lost_path(part: Path) -> Path:
 
 
 def _write_lost(part: Path, lost: Mapping[str, tuple[str, str]]) -> None:
-    write_whole(_lost_path(part), json.dumps(lost))
+    atomic_write(_lost_path(part), json.dumps(lost))
 
 
 def _read_lost(part: Path) -> dict[str, tuple[str, str]]:

@@ -20,11 +20,11 @@ from lerobot_roborecover.curation.annotation.votes import check_name
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig
-from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from lerobot_roborecover.curation.pipeline.requests import assignments
 from lerobot_roborecover.curation.render import check_size
 from lerobot_roborecover.curation.screen.screening import CURTAILED_LEAST, ScreenRule
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -60,7 +60,7 @@ def check_build(config: ChainConfig) -> list[str]:
     Returns:
         Problems, one a line, each with its place in the file; empty where there are none.
     """
-    problems, places = _Problems(), Places(config)
+    problems, places = _Problems(), BuildPaths(config)
     _check_folders(problems, places)
     for name, part in config.collect.items():
         where = f"collect.{name}"
@@ -114,7 +114,7 @@ def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
     """
     from lerobot.policies import get_policy_class
 
-    from lerobot_roborecover.trials.load import policy_config
+    from lerobot_roborecover.evaluation.loading import policy_config
 
     try:
         config = policy_config(path, assignments(options))
@@ -125,7 +125,7 @@ def check_checkpoint(path: str, options: Mapping[str, Any]) -> None:
         raise OptionError(f"{path} cannot be loaded: {type(err).__name__}: {err!s:.300}") from None
 
 
-def _check_folders(problems: _Problems, places: Places) -> None:
+def _check_folders(problems: _Problems, places: BuildPaths) -> None:
     with problems.of("out"):
         root = places.root
         there = next(p for p in (root, *root.absolute().parents) if p.exists())
@@ -192,7 +192,7 @@ def _check_votes(folder: Path, *, named: bool) -> None:
         check_name(path.stem)
 
 
-def _check_screen(problems: _Problems, config: ChainConfig, places: Places) -> None:
+def _check_screen(problems: _Problems, config: ChainConfig, places: BuildPaths) -> None:
     rule = ScreenRule()
     with problems.of("screen.keep"):
         rule = requests.screen_rule(config)

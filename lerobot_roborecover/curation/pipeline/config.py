@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.datasets.licenses import license_metadata
-from lerobot_roborecover.env.options import OptionError
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_names
 from lerobot_roborecover.scenario import ScenarioError
 

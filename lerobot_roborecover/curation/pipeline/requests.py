@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lerobot_roborecover.curation.agree import AgreeRequest
-from lerobot_roborecover.curation.collect.judge import Judging
+from lerobot_roborecover.curation.collect.judge import FilterConfig
 from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
 from lerobot_roborecover.curation.collect.starts import parse_numbers
 from lerobot_roborecover.curation.pipeline.config import (
@@ -22,7 +22,7 @@ from lerobot_roborecover.curation.pipeline.config import (
     ScreenPart,
     ValidatePart,
 )
-from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from lerobot_roborecover.curation.publishing import PublishRequest
 from lerobot_roborecover.curation.render import RenderRequest
 from lerobot_roborecover.curation.resolution import ResolutionConfig
@@ -33,9 +33,9 @@ from lerobot_roborecover.curation.split import SplitConfig, check_least, check_s
 from lerobot_roborecover.curation.validate.request import ValidationRequest, read_rejects
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.datasets.publish import PublishConfig
-from lerobot_roborecover.env.identity import policy_identity
 from lerobot_roborecover.platforms.starts import Starts
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.policies.identity import policy_identity
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 
 def given[T](value: T | None, default: T) -> T:
@@ -54,9 +54,9 @@ def _text(value: object) -> str:
     return json.dumps(value) if isinstance(value, (list, dict)) else str(value)
 
 
-def workplace(part: CollectPart | ScreenPart | ValidatePart) -> Workplace:
+def workplace(part: CollectPart | ScreenPart | ValidatePart) -> Backend:
     """Where a stage's simulators are."""
-    return Workplace(given(part.engine, HERE.engine), given(part.ray_address, HERE.address))
+    return Backend(given(part.engine, LOCAL.engine), given(part.ray_address, LOCAL.address))
 
 
 def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path) -> CollectOptions:
@@ -80,10 +80,10 @@ def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path
         trials=given(part.trials, Starts.trials),
         reset_seed=given(part.reset_seed, Starts.reset_seed),
     )
-    judging = Judging(
+    judging = FilterConfig(
         tuple(part.no_exclude),
         tuple(part.exclude_only),
-        given(part.scene_touched, Judging.scene_touched_mm),
+        given(part.scene_touched, FilterConfig.scene_touched_mm),
     )
     return CollectOptions(
         platform=config.platform,
@@ -137,7 +137,7 @@ def resolution_config(config: ChainConfig) -> ResolutionConfig:
     return ResolutionConfig(part.votes_needed, part.tolerance, no_consensus)
 
 
-def agree_request(config: ChainConfig, places: Places) -> AgreeRequest:
+def agree_request(config: ChainConfig, places: BuildPaths) -> AgreeRequest:
     """Of the votes on all candidates."""
     return AgreeRequest(
         dataset=places.candidates,
@@ -165,7 +165,7 @@ def screen_rule(config: ChainConfig) -> ScreenRule:
     )
 
 
-def screen_request(config: ChainConfig, places: Places, rule: ScreenRule) -> ScreenRequest:
+def screen_request(config: ChainConfig, places: BuildPaths, rule: ScreenRule) -> ScreenRequest:
     """Of the scenarios that the votes resolved to.
 
     Args:
@@ -197,7 +197,7 @@ def screen_request(config: ChainConfig, places: Places, rule: ScreenRule) -> Scr
     )
 
 
-def validation_request(config: ChainConfig, places: Places) -> ValidationRequest:
+def validation_request(config: ChainConfig, places: BuildPaths) -> ValidationRequest:
     """Of the scenarios that screening kept.
 
     Raises:
@@ -240,7 +240,7 @@ def split_config(config: ChainConfig) -> SplitConfig:
     )
 
 
-def render_request(config: ChainConfig, places: Places) -> RenderRequest:
+def render_request(config: ChainConfig, places: BuildPaths) -> RenderRequest:
     """Of the divided scenarios."""
     part, default = given(config.render, RenderPart()), RenderRequest
     return RenderRequest(
@@ -252,7 +252,7 @@ def render_request(config: ChainConfig, places: Places) -> RenderRequest:
     )
 
 
-def publish_request(part: PublishPart, places: Places) -> PublishRequest:
+def publish_request(part: PublishPart, places: BuildPaths) -> PublishRequest:
     """Of what a build ends with."""
     default = PublishConfig
     publish = PublishConfig(

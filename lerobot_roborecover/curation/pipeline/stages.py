@@ -21,22 +21,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import read_decisions
 from lerobot_roborecover.curation.candidates import CANDIDATES_FILE, STEPS_FILE, read_candidates
 from lerobot_roborecover.curation.candidates_write import merge_candidates
+from lerobot_roborecover.curation.funnel import read_decisions
 from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig
-from lerobot_roborecover.curation.pipeline.places import Places
-from lerobot_roborecover.curation.pipeline.work import Work
+from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.resolution import queued, resolve, write_discussion
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.write import file_sha256
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.journal import Journal, read_journal
+from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import new_folder
-from lerobot_roborecover.words import counted, lasting, next_line
+from lerobot_roborecover.utils.atomic_io import atomic_dir
+from lerobot_roborecover.utils.journal import Journal, read_journal
+from lerobot_roborecover.utils.text import format_duration, next_command, pluralize
 
 STAGES = ("collect", "join", "annotate", "agree", "screen", "validate", "split", "render", "publish")
 JOURNAL_FILE = "stages.jsonl"
@@ -47,12 +46,12 @@ _ADDED = {"curtail", "least"}
 """Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 
-class Waiting(Exception):
+class AwaitingAnnotations(Exception):
     """A stage waits for people; the message says for what, and how to go on."""
 
 
 @dataclass
-class ChainStage:
+class PipelineStage:
     """One step of the chain."""
 
     name: str
@@ -68,7 +67,7 @@ class ChainStage:
     """False where there is something to do although nothing has changed: votes are missing."""
 
 
-class Pace:
+class BuildEta:
     """Says how far a build is.
 
     Args:
@@ -86,15 +85,15 @@ class Pace:
         left = [self._seconds.get(later) for later in self._labels[number:]]
         known = sum(s for s in left if s is not None)
         unknown = sum(s is None for s in left)
-        words = f"about {lasting(known)}" if unknown < len(left) else "not known yet"
+        words = f"about {format_duration(known)}" if unknown < len(left) else "not known yet"
         if 0 < unknown < len(left):
-            words += f" and {counted(unknown, 'stage')} never timed"
-        elapsed = lasting(time.monotonic() - self._began)
+            words += f" and {pluralize(unknown, 'stage')} never timed"
+        elapsed = format_duration(time.monotonic() - self._began)
         return f"[stage {number + 1} of {len(self._labels)}, {elapsed} elapsed, left at most: {words}]"
 
 
 @dataclass
-class Chain:
+class Pipeline:
     """A build.
 
     Args:
@@ -104,12 +103,12 @@ class Chain:
     """
 
     config: ChainConfig
-    work: Work
+    work: StageRunners
     say: Callable[[str], None] = print
-    places: Places = field(init=False)
+    places: BuildPaths = field(init=False)
 
     def __post_init__(self):
-        self.places = Places(self.config)
+        self.places = BuildPaths(self.config)
 
     def build(self, first: str = "", until: str = "", dry_run: bool = False) -> list[dict[str, Any]]:
         """Runs what is not up to date.
@@ -138,7 +137,7 @@ class Chain:
         with nullcontext() if dry_run else Journal(path, _SCHEMA) as journal:
             records = read_journal(path, _SCHEMA)
             known = {r["label"]: r["key"] for r in records}
-            pace = Pace(self.labels(until), {r["label"]: r["seconds"] for r in records})
+            pace = BuildEta(self.labels(until), {r["label"]: r["seconds"] for r in records})
             key, anew = "", False
             for stage in self._stages():
                 if until and STAGES.index(stage.name) > STAGES.index(until):
@@ -178,7 +177,7 @@ class Chain:
         found["publish"] *= config.publish is not None
         return [label for name in STAGES[:before] for label in found[name]]
 
-    def _stages(self) -> Iterator[ChainStage]:
+    def _stages(self) -> Iterator[PipelineStage]:
         """The stages in order; each is asked for its inputs only when its turn has come."""
         config, places, work = self.config, self.places, self.work
         for name, part in config.collect.items():
@@ -187,7 +186,7 @@ class Chain:
                 continue
             out = places.collected(name)
             options = requests.collect_options(config, name, part, out)
-            yield ChainStage(
+            yield PipelineStage(
                 "collect",
                 f"collect {name}",
                 out,
@@ -195,19 +194,19 @@ class Chain:
                 lambda options=options: work.collect(options, self.say),
             )
         inputs = [Path(p.dataset) if p.dataset else places.collected(n) for n, p in config.collect.items()]
-        yield ChainStage(
+        yield PipelineStage(
             "join", "join", places.candidates, [_identity(p) for p in inputs], lambda: self._join(inputs)
         )
-        yield ChainStage("annotate", "annotate", None, None, self._annotate, not self._open())
+        yield PipelineStage("annotate", "annotate", None, None, self._annotate, not self._open())
         votes = {p.name: file_sha256(p) for p in sorted(places.votes.glob("*.jsonl"))}
-        yield ChainStage(
+        yield PipelineStage(
             "agree",
             "agree",
             places.scenarios,
             [_options(config.annotate), votes, config.license],
             lambda: work.agree(requests.agree_request(config, places), self.say),
         )
-        yield ChainStage(
+        yield PipelineStage(
             "screen",
             "screen",
             places.screened,
@@ -220,14 +219,14 @@ class Chain:
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"
         # `validate` itself leaves an empty record of rejections behind.
         looked = [file_sha256(p) for p in (rejects, people) if p and p.is_file() and p.stat().st_size]
-        yield ChainStage(
+        yield PipelineStage(
             "validate",
             "validate",
             places.validated,
             [_options(config.validate), looked],
             lambda: work.validate(requests.validation_request(config, places), self.say),
         )
-        yield ChainStage(
+        yield PipelineStage(
             "split",
             "split",
             places.split,
@@ -235,7 +234,7 @@ class Chain:
             lambda: work.split(places.validated, requests.split_config(config), places.split, self.say),
         )
         if config.render is not None:
-            yield ChainStage(
+            yield PipelineStage(
                 "render",
                 "render",
                 places.rendered,
@@ -243,7 +242,7 @@ class Chain:
                 lambda: work.render(requests.render_request(config, places), self.say),
             )
         if (publish := config.publish) is not None:
-            yield ChainStage(
+            yield PipelineStage(
                 "publish",
                 "publish",
                 None,
@@ -251,7 +250,7 @@ class Chain:
                 lambda: work.publish(requests.publish_request(publish, places), self.say),
             )
 
-    def _run(self, stage: ChainStage) -> None:
+    def _run(self, stage: PipelineStage) -> None:
         """Runs a stage.
 
         Raises:
@@ -288,10 +287,10 @@ class Chain:
         present = [path for path in inputs if path.exists()]
         if not present:
             raise ScenarioError("nothing was collected at all; see the tables above")
-        with new_folder(self.places.candidates) as folder:
+        with atomic_dir(self.places.candidates) as folder:
             merge_candidates(folder, present)
         total = len(read_candidates(self.places.candidates))
-        joined = f"{counted(total, 'candidate')} of {counted(len(present), 'dataset')}"
+        joined = f"{pluralize(total, 'candidate')} of {pluralize(len(present), 'dataset')}"
         self.say(f"{joined} in {self.places.candidates}")
 
     def _open(self) -> dict[str, int]:
@@ -319,22 +318,22 @@ class Chain:
         base += ["--annotator", "NAME"]
         if waiting.get("waiting"):
             several = waiting["waiting"] != 1
-            raise Waiting(
-                f"{counted(waiting['waiting'], 'candidate')} {'wait' if several else 'waits'} for votes "
+            raise AwaitingAnnotations(
+                f"{pluralize(waiting['waiting'], 'candidate')} {'wait' if several else 'waits'} for votes "
                 f"({self.config.annotate.votes_needed} each). Annotate (--annotator may be given again), "
-                f"then run build again\n{next_line(base)}"
+                f"then run build again\n{next_command(base)}"
             )
         several = waiting["no consensus"] != 1
-        raise Waiting(
-            f"{counted(waiting['no consensus'], 'candidate')} {'are' if several else 'is'} without "
+        raise AwaitingAnnotations(
+            f"{pluralize(waiting['no consensus'], 'candidate')} {'are' if several else 'is'} without "
             "consensus. Discuss, then run build again; or set annotate.no_consensus: drop\n"
-            + next_line([*base, "--only", str(self.places.discuss)])
+            + next_command([*base, "--only", str(self.places.discuss)])
         )
 
 
 def _options(part: Any) -> Any:
     """What of a part decides a result; checkpoints by their content."""
-    from lerobot_roborecover.env.identity import policy_identity
+    from lerobot_roborecover.policies.identity import policy_identity
 
     given = asdict(part).items()
     found = {k: v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
@@ -355,6 +354,6 @@ def _identity(dataset: Path) -> Any:
     return [[file_sha256(folder / n) for n in (CANDIDATES_FILE, STEPS_FILE)], decisions]
 
 
-def _key(before: str, stage: ChainStage) -> str:
+def _key(before: str, stage: PipelineStage) -> str:
     text = json.dumps([before, stage.label, stage.identity], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -8,22 +8,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import StageCounts, attrition_table, count_stages, read_decisions
-from lerobot_roborecover.curation.pipeline.places import Places
+from lerobot_roborecover.curation.funnel import StageCounts, attrition_table, count_stages, read_decisions
+from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from lerobot_roborecover.curation.split_dataset import check_splits, format_report
 from lerobot_roborecover.datasets.schema import FOLDER
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 FUNNEL_FILE = "funnel.md"
 
 
-def write_summary(places: Places, config: Path, done: Sequence[Mapping[str, Any]]) -> str:
+def write_summary(places: BuildPaths, config: Path, done: Sequence[Mapping[str, Any]]) -> str:
     """Writes the summary folder from the latest dataset that there is.
 
     Args:
         places: of the build.
         config: its file, which is copied.
-        done: what `Chain.build` returned.
+        done: what `Pipeline.build` returned.
 
     Returns:
         The funnel as text; empty where nothing was decided yet.
@@ -42,10 +42,10 @@ def write_summary(places: Places, config: Path, done: Sequence[Mapping[str, Any]
             break
     places.summary.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(config, places.summary / "build.yaml")
-    write_whole(places.summary / FUNNEL_FILE, markdown(rows))
-    write_whole(places.summary / "stages.json", json.dumps(list(done), indent=1) + "\n")
+    atomic_write(places.summary / FUNNEL_FILE, markdown(rows))
+    atomic_write(places.summary / "stages.json", json.dumps(list(done), indent=1) + "\n")
     if places.split.exists():
-        write_whole(places.summary / "splits.txt", format_report(check_splits(places.split, None)) + "\n")
+        atomic_write(places.summary / "splits.txt", format_report(check_splits(places.split, None)) + "\n")
         shutil.copyfile(places.split / FOLDER / "split.json", places.summary / "split.json")
     return attrition_table(rows) if rows else ""
 

@@ -25,7 +25,7 @@ from lerobot_roborecover.curation.screen.dataset import ScreenRequest
 from lerobot_roborecover.curation.split import SplitConfig
 from lerobot_roborecover.curation.validate import dataset as validation
 from lerobot_roborecover.curation.validate.request import ValidationRequest
-from lerobot_roborecover.progress import Progress
+from lerobot_roborecover.utils.progress import Progress
 
 type Say = Callable[[str], None]
 """Takes lines for people."""
@@ -76,7 +76,7 @@ def _note(line: str) -> None:
 
 
 @dataclass(frozen=True)
-class Work:
+class StageRunners:
     """The function of each stage; it returns once the stage's result is there."""
 
     collect: Callable[[CollectOptions, Say], None] = collect

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from lerobot_roborecover.curation.attrition import attrition_table, count_stages, read_decisions
+from lerobot_roborecover.curation.funnel import attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.screen.runs import (
     PolicySpec,
     check_policies,
@@ -30,13 +30,13 @@ from lerobot_roborecover.curation.screen.tables import (
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios, read_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.temporary import TemporaryFolder
-from lerobot_roborecover.whole import check_new
-from lerobot_roborecover.words import counted, next_line
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.utils.atomic_io import check_new
+from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.utils.text import next_command, pluralize
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 SCREENING_FILE = "screening.json"
 
@@ -68,7 +68,7 @@ class ScreenRequest:
     slots: int = 0
     max_batch: int = 1
     """Observations per inference, at most; above 1 outcomes depend on who shares a batch."""
-    workplace: Workplace = HERE
+    workplace: Backend = LOCAL
     """Where trials are run."""
     replicas: int = 0
     """Copies of a policy on a cluster; 0 takes one per GPU, or one on the CPU."""
@@ -212,15 +212,15 @@ def describe(request: ScreenRequest, made: Screening) -> str:
     low, high = rule.check(policies)
     kept = sum(s.decision.verdict == "kept" for s in made.found)
     head = (
-        f"{kept} of {counted(len(made.found), 'scenario')} in {request.out}: {low} to {high} successes of "
-        f"{policies * rule.trials} ({counted(policies, 'policy')} x {counted(rule.trials, 'trial')})"
+        f"{kept} of {pluralize(len(made.found), 'scenario')} in {request.out}: {low} to {high} successes of "
+        f"{policies * rule.trials} ({pluralize(policies, 'policy')} x {pluralize(rule.trials, 'trial')})"
     )
     tables = (
         format_policies(made.found),
         format_settled(made.found) if rule.curtail else format_histogram(made.found, rule),
         attrition_table(count_stages(read_decisions(request.out))),
     )
-    return "\n\n".join((head, *tables, next_line(validate_next(request.out, request.trials))))
+    return "\n\n".join((head, *tables, next_command(validate_next(request.out, request.trials))))
 
 
 def validate_next(out: Path, trials: Path) -> list[str]:

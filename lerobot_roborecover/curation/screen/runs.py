@@ -23,12 +23,12 @@ from lerobot_roborecover.curation.policy_trials import (
     read_trials,
     run_trials,
 )
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, actions_path
-from lerobot_roborecover.env.trial_log import TrialLog, check_retry
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.trial_log import TrialLog, check_retry
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import new_file, write_whole
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.utils.atomic_io import atomic_file, atomic_write
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 POLICY_FILE = "policy.json"
 RETRIED_FILE = "retried.jsonl"
@@ -62,7 +62,7 @@ class PolicySpec:
 
 def default_name(path: str) -> str:
     """A policy's name where none is given: its identity without the hash."""
-    from lerobot_roborecover.env.identity import policy_name
+    from lerobot_roborecover.policies.identity import policy_name
 
     return policy_name(path).strip("/").replace("/", "--")[:64]
 
@@ -179,7 +179,7 @@ def run_policy(
     device: str | None = None,
     slots: int = 0,
     max_batch: int = 1,
-    workplace: Workplace = HERE,
+    workplace: Backend = LOCAL,
     replicas: int = 0,
     snapshots: Path | None = None,
     on_row: Callable[[Any, int, int], None] = lambda row, done, total: None,
@@ -239,7 +239,7 @@ def claim_folder(policy: PolicySpec, folder: Path, env: Sequence[str] = ()) -> N
                     "policy another name (--policy NAME=PATH), or name another --trials-folder"
                 )
         return
-    write_whole(path, json.dumps(document, indent=1) + "\n")
+    atomic_write(path, json.dumps(document, indent=1) + "\n")
 
 
 def take_trials(source: Path, target: Path) -> int:
@@ -281,7 +281,7 @@ def take_trials(source: Path, target: Path) -> int:
             if before is not None:
                 continue
             if row.steps:
-                with new_file(actions_path(target / ACTIONS_FOLDER, row)) as copy:
+                with atomic_file(actions_path(target / ACTIONS_FOLDER, row)) as copy:
                     shutil.copyfile(actions_path(source / ACTIONS_FOLDER, row), copy)
             log.append(row)
             new += 1

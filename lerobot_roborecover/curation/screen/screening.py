@@ -18,10 +18,10 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.curation.funnel import Decision
 from lerobot_roborecover.curation.policy_trials import check_repeats
 from lerobot_roborecover.curation.validate.validation import ValidationRule
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
 KEEP = ("0.1", "0.9")

@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.monitor_data.frames import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.curation.training.lines import TrainingLine
 from lerobot_roborecover.curation.training.returns import returns_to_go, values
+from lerobot_roborecover.datasets.rendered_steps import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 PROGRESS_FILE = "sarm_progress.parquet"
 """Name by which LeRobot finds it in the dataset's folder."""
@@ -115,7 +115,7 @@ def export_training(
             on_episode(number, len(lines))
 
     def finish(folder: Path) -> None:
-        write_whole(folder / PROGRESS_FILE, progress_parquet(told))
+        atomic_write(folder / PROGRESS_FILE, progress_parquet(told))
         also(folder)
 
     write_trajectories(

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.fork_gain import MATCHED, note_of
-from lerobot_roborecover.curation.monitor_data.choice import from_rollouts
+from lerobot_roborecover.curation.continuations import from_rollouts
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
-from lerobot_roborecover.env.trial_actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.env.trial_log import read_trial_log
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, Scenario
 

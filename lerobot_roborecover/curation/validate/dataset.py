@@ -13,14 +13,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.attrition import (
+from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.funnel import (
     STAGES,
     Decision,
     attrition_table,
     count_stages,
     read_decisions,
 )
-from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.curation.validate.jobs import make_jobs, read_screening, simulator_versions
 from lerobot_roborecover.curation.validate.originals import OriginalFrames
@@ -37,11 +37,11 @@ from lerobot_roborecover.curation.validate.validation import (
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.video_frames import check_frames
-from lerobot_roborecover.env.options import OptionError
-from lerobot_roborecover.journal import Journal
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import check_new, new_folder, write_whole
-from lerobot_roborecover.words import next_line
+from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write, check_new
+from lerobot_roborecover.utils.journal import Journal
+from lerobot_roborecover.utils.text import next_command
 from lerobot_roborecover.workers.jobs import Done, JobPool, Outcome
 from lerobot_roborecover.workers.messages import SlotFailure
 
@@ -115,7 +115,7 @@ def describe(request: ValidationRequest, made: Validation) -> str:
             format_validation(made.replays, made.decisions, request.rule) + "\n",
             attrition_table(count_stages(read_decisions(request.out))),
             f"\n{request.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out",
-            next_line(["split", str(request.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]),
+            next_command(["split", str(request.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]),
         )
     )
 
@@ -168,7 +168,7 @@ def replay_all(
                 report = _report_of(job, outcome)
                 result = report.replays
                 if report.sheet:
-                    write_whole(request.sheet(job.scenario.id), report.sheet)
+                    atomic_write(request.sheet(job.scenario.id), report.sheet)
                 if not (isinstance(outcome, SlotFailure) and outcome.kind == "lost"):
                     journal.append({"key": job.key, "id": job.scenario.id, "replays": asdict(result)})
                 found[job.scenario.id] = result
@@ -216,7 +216,7 @@ def _write(
     record: Mapping[str, Any],
     manifest: Mapping[str, Any],
 ) -> None:
-    with new_folder(request.out, replace=True) as folder:
+    with atomic_dir(request.out, replace=True) as folder:
         write_stage(folder, request.dataset, kept, decisions, (VALIDATION_FILE, record), manifest)
 
 

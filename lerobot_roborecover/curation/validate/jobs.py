@@ -20,7 +20,7 @@ from lerobot_roborecover.curation.validate.replay import DrawnRun, OriginalRollo
 from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.curation.validate.validation import draw_runs
 from lerobot_roborecover.datasets.frames import KEPT
-from lerobot_roborecover.env.trial_row import TrialRow
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms.versions import installed, required
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 

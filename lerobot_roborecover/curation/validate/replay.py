@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.validate.sheets import draw_sheet
 from lerobot_roborecover.curation.validate.validation import CRASH, INVALID_ACTION, Replays, RunReplay
 from lerobot_roborecover.datasets.frames import KEPT, camera_pictures
 from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator
-from lerobot_roborecover.platforms.walk import Steppable, follow
+from lerobot_roborecover.platforms.stepping import Steppable, follow
 from lerobot_roborecover.scenario import Pose, Scenario, ScenarioError
 
 
@@ -210,7 +210,7 @@ def _replay_run(
     simulator: Simulator, job: ReplayJob, run: DrawnRun, first: int
 ) -> tuple[RunReplay, _ReplayTrace]:
     """Prefix and run, once."""
-    from lerobot_roborecover.rewind import Trail
+    from lerobot_roborecover.replay.rollback import RollbackHistory
 
     scenario, step = job.scenario, len(job.scenario.prefix)
     seen = _walk(simulator, scenario, first, job.originals is not None)
@@ -222,7 +222,7 @@ def _replay_run(
         recorded[step] = scenario.fingerprint.bodies
     eef, objects, worst = _displacements(seen.bodies, recorded)
     state, solved = simulator.state_sha256(), simulator.succeeded()
-    trail = Trail(simulator, scenario.rollout, step, control_mode=run.control_mode)
+    trail = RollbackHistory(simulator, scenario.rollout, step, control_mode=run.control_mode)
     ended = ("horizon", len(run.actions))
     for number in _follow(trail, run.actions, lambda n: f"action {n} of {run.policy}, trial {run.trial}"):
         if number and simulator.succeeded():

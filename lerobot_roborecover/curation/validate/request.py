@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ValidationRequest:
     """Who looked; goes into the decisions."""
     workers: int = 0
     """Processes that replay; 0 takes one, or all CPUs of a cluster."""
-    workplace: Workplace = HERE
+    workplace: Backend = LOCAL
     """Where they are."""
     limit_s: float = 900.0
     """Longest that all replays of one scenario may take."""

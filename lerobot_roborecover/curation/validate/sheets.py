@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.attrition import Decision
+from lerobot_roborecover.curation.funnel import Decision
 from lerobot_roborecover.curation.validate.validation import Replays, ValidationRule
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
 
 AMPLIFIED = 4
 """What differences are multiplied with, to be seen."""
@@ -94,7 +94,7 @@ def write_page(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True
     ).get_template("page.html.j2")
     text = template.render(entries=entries, rule=rule, command=command)
-    write_whole(path, text)
+    atomic_write(path, text)
 
 
 def _badness(replays: Replays, decision: Decision, scenario_id: str) -> tuple:

@@ -18,9 +18,9 @@ from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.write import write_scenarios
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Scenario, ScenarioError
-from lerobot_roborecover.temporary import TemporaryFolder
-from lerobot_roborecover.whole import new_folder
-from lerobot_roborecover.workers.workplace import HERE, Workplace
+from lerobot_roborecover.utils.atomic_io import atomic_dir
+from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 _SHOWN = 3
 
@@ -41,7 +41,7 @@ def write_states(
     out: Path,
     workers: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    workplace: Workplace = HERE,
+    workplace: Backend = LOCAL,
 ) -> StatesReport:
     """Writes a copy of a dataset whose scenarios all have the hash of their state at the recovery point.
 
@@ -86,7 +86,7 @@ def write_states(
             + "; ".join(problems[:_SHOWN])
         )
     frames = FrameStore(root)
-    with new_folder(out) as folder:
+    with atomic_dir(out) as folder:
         for name in list_files(root):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(root / name, folder / name)

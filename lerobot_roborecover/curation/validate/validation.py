@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.attrition import Decision, VerdictName
+from lerobot_roborecover.curation.funnel import Decision, VerdictName
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Pose, Scenario, ScenarioError
 
 PAPER_PASS_RATE = 0.9732

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from lerobot_roborecover.datasets.release.fields import LiftedByOption, check_labels
+from lerobot_roborecover.datasets.release.fields import RequiresOptIn, check_labels
 from lerobot_roborecover.datasets.release.json_form import KEY
 from lerobot_roborecover.datasets.release.record import RULES, Reading, to_scenario
 from lerobot_roborecover.datasets.release.tables import (
@@ -164,7 +164,7 @@ def read_record(
             reading=reading,
         )
         check_limits(scenario)
-    except LiftedByOption:
+    except RequiresOptIn:
         raise
     except ScenarioError as err:
         raise ScenarioError(f"{err}. {remedy}") from None

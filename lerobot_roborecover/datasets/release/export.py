@@ -18,7 +18,7 @@ from lerobot_roborecover.datasets.release.tables import (
     table_name,
 )
 from lerobot_roborecover.scenario import Scenario, ScenarioError
-from lerobot_roborecover.whole import new_folder
+from lerobot_roborecover.utils.atomic_io import atomic_dir
 
 
 def export_release(scenarios: Sequence[Scenario], out: str | os.PathLike[str]) -> list[Problem]:
@@ -38,7 +38,7 @@ def export_release(scenarios: Sequence[Scenario], out: str | os.PathLike[str]) -
     out = Path(out)
     changed = []
     tables: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
-    with new_folder(out) as folder:
+    with atomic_dir(out) as folder:
         for scenario in scenarios:
             data = to_json(scenario)
             number, note, row = _export_note(scenario)

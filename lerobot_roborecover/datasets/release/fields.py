@@ -17,7 +17,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u206
 _LABELS = re.compile(r"S:([^;]*);D:([^;]*)")
 
 
-class LiftedByOption(ScenarioError):
+class RequiresOptIn(ScenarioError):
     """A record is refused until the user asks for it by the option that the message names."""
 
 
@@ -111,7 +111,7 @@ def check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) -> 
     """Checks that a record has its platform's fields, and each of them by itself.
 
     Raises:
-        LiftedByOption: it has others, and no option keeps them.
+        RequiresOptIn: it has others, and no option keeps them.
         ScenarioError: a field is missing or is not what it must be.
     """
     fields = _FIELDS[platform]
@@ -120,7 +120,7 @@ def check_fields(platform: str, record: Mapping[str, Any], keep_extra: bool) -> 
         raise ScenarioError(f"field {missing[0]}: missing; a {platform} record has {', '.join(fields)}")
     extra = [name for name in record if name not in fields and name not in _OPTIONAL[platform]]
     if extra and not keep_extra:
-        raise LiftedByOption(
+        raise RequiresOptIn(
             f"field {extra[0]!r:.80}: not of the {platform} release format; convert with --keep-extra to "
             "keep such fields in the provenance"
         )

@@ -147,8 +147,8 @@ def record_fixtures() -> dict[str, Any]:
 if __name__ == "__main__":
     from pathlib import Path
 
-    from lerobot_roborecover.whole import write_whole
+    from lerobot_roborecover.utils.atomic_io import atomic_write
 
     place = Path(str(importlib.resources.files("lerobot_roborecover"))) / _FILE
-    write_whole(place, json.dumps(record_fixtures(), indent=1) + "\n")
+    atomic_write(place, json.dumps(record_fixtures(), indent=1) + "\n")
     print(place)

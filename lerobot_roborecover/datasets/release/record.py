@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.datasets.release.fields import LiftedByOption, check_fields
+from lerobot_roborecover.datasets.release.fields import RequiresOptIn, check_fields
 from lerobot_roborecover.datasets.release.json_form import KEY, form_of, parse_json
 from lerobot_roborecover.datasets.release.sources import Sources
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_instruction, libero_tasks
@@ -76,10 +76,10 @@ def check_seed(seed: int | None, reading: Reading) -> None:
     """Checks that a LIBERO reset has the release's seed.
 
     Raises:
-        LiftedByOption: it has another, and nobody asked for that.
+        RequiresOptIn: it has another, and nobody asked for that.
     """
     if seed != LIBERO_SEED and not reading.any_seed:
-        raise LiftedByOption(
+        raise RequiresOptIn(
             f"field seed: {seed}; the release resets every LIBERO scenario with env.seed({LIBERO_SEED}). "
             "Another seed puts fixtures millimetres to centimetres elsewhere, which no field of a record "
             "would show. To take such records with their own seeds: --any-seed"

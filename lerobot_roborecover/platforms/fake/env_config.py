@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lerobot_roborecover.platforms.base import SimulatorSetup, no_video
-from lerobot_roborecover.platforms.plain_config import PlainConfig
+from lerobot_roborecover.platforms.plain_config import StateEnvConfig
 
 
 @dataclass
-class FakeConfig(PlainConfig):
+class FakeConfig(StateEnvConfig):
     """Recovery scenarios on the point-mass simulator: for trying the machinery, not for scores."""
 
     action_width = 2

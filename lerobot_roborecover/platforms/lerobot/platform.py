@@ -67,7 +67,7 @@ class LeRobotPlatform(Platform):
         """With the type."""
         return f"{self.env_type}.{task.name}"
 
-    def cannot_drive(self, task: Task) -> str:
+    def unsupported_reason(self, task: Task) -> str:
         """Aloha's insertion has no script."""
         return "its driver transfers the cube alone" if task.name == "AlohaInsertion-v0" else ""
 
@@ -123,7 +123,7 @@ _SEEN = (
 """Options of environments that decide what is seen of them, and no physics."""
 
 
-class LeRobotFamily(Platform):
+class LeRobotEnvPlatform(Platform):
     """`--env roborecover_lerobot --env.base.type=NAME`: every member under one env type."""
 
     name: ClassVar[str] = FAMILY_NAME
@@ -134,7 +134,7 @@ class LeRobotFamily(Platform):
     simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
     default_scenarios = "pusht_starter"
 
-    def member_of(self, options: Sequence[str]) -> Platform:
+    def resolve(self, options: Sequence[str]) -> Platform:
         """The platform that `base.type=NAME` names; PushT where nothing does."""
         chosen = [o.partition("=")[2] for o in options if o.lstrip("-").startswith("base.type=")]
         return member(member_name(chosen[-1] if chosen else DEFAULT_TYPE))
@@ -158,7 +158,7 @@ class LeRobotFamily(Platform):
         return LeRobotConfig
 
 
-FAMILY = LeRobotFamily()
+FAMILY = LeRobotEnvPlatform()
 
 
 def member_name(env_type: str) -> str:

@@ -17,8 +17,8 @@ from functools import cache
 from pathlib import Path
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
-from lerobot_roborecover.temporary import TemporaryFolder
-from lerobot_roborecover.whole import write_whole
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.temporary import TemporaryFolder
 
 ASSETS_VARIABLE = "ROBORECOVER_LIBERO_ASSETS"
 """Environment variable that names the asset folder."""
@@ -213,10 +213,10 @@ def _private_config(assets: Path) -> Path:
     name = f"libero-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     folder = cache_folder() / name
     try:
-        write_whole(folder / "config.yaml", text)
+        atomic_write(folder / "config.yaml", text)
     except OSError:  # no writable home, as in some containers
         folder = _own_config().path
-        write_whole(folder / "config.yaml", text)
+        atomic_write(folder / "config.yaml", text)
     return folder
 
 

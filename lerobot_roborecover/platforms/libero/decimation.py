@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from lerobot_roborecover.platforms.simulator import SimulatorError
-from lerobot_roborecover.whole import new_file
+from lerobot_roborecover.utils.atomic_io import atomic_file
 
 _VERSION = "1"
 """Of what `decimate` makes; another one leaves the cache's entries unread."""
@@ -84,7 +84,7 @@ def cached_decimation(surface: Surface, faces: int, folder: Path) -> Surface:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         made = decimate(surface, faces)
     # Without a writable cache, as in some containers, it is made at every load.
-    with suppress(OSError), new_file(path) as temporary, temporary.open("wb") as file:
+    with suppress(OSError), atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **{field.name: getattr(made, field.name) for field in fields(Surface)})
     return made
 

@@ -13,8 +13,8 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
-    FilmedEnvConfig,
     SimulatorSetup,
+    VideoEnvMixin,
     check_quality,
     chosen_quality,
     first_camera,
@@ -31,7 +31,7 @@ mixes them."""
 
 
 @dataclass
-class LiberoConfig(LiberoEnv, FilmedEnvConfig):
+class LiberoConfig(LiberoEnv, VideoEnvMixin):
     """Recovery scenarios on LIBERO."""
 
     assets_dir: str = ""

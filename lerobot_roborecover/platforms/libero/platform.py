@@ -32,7 +32,7 @@ class LiberoPlatform(Platform):
     axis_angle = {8: (3, 4, 5)}
     records_control_mode = "relative"
     settle_steps = 10  # LeRobot and the paper's release
-    turned_pictures = True
+    images_rotated_180 = True
     # MuJoCo 3.4 changed box contacts: LIBERO-Spatial task 5 falls from 98 % to 12 %
     # (https://github.com/huggingface/lerobot/issues/4390). robosuite 1.4.1, which the paper used, differs
     # from 1.4.0 in refactors and new objects only.
@@ -70,7 +70,7 @@ class LiberoPlatform(Platform):
         """Stay, gripper open; what LIBERO settles with."""
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
-    def cannot_drive(self, task: Task) -> str:
+    def unsupported_reason(self, task: Task) -> str:
         """The scripted drivers know all predicates of the four suites."""
         from lerobot_roborecover.platforms.libero.catalog import libero_goal
         from lerobot_roborecover.platforms.libero.goals import PREDICATES
@@ -129,7 +129,7 @@ class LiberoPlatform(Platform):
         except SimulatorError as err:
             return [Check(name, status, "no complete folder", str(err))]
 
-    def salt(self, options: Mapping[str, Any]) -> dict[str, str | None]:
+    def environment_fingerprint(self, options: Mapping[str, Any]) -> dict[str, str | None]:
         """The folder of assets."""
         return {"assets_dir": options.get("assets_dir"), ASSETS_VARIABLE: os.environ.get(ASSETS_VARIABLE)}
 

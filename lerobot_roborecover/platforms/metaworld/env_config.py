@@ -9,8 +9,8 @@ from lerobot.envs.configs import MetaworldEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.platforms.base import (
-    FilmedEnvConfig,
     SimulatorSetup,
+    VideoEnvMixin,
     check_quality,
     chosen_quality,
     first_camera,
@@ -20,7 +20,7 @@ from lerobot_roborecover.platforms.base import (
 
 
 @dataclass
-class MetaworldConfig(MetaworldEnv, FilmedEnvConfig):
+class MetaworldConfig(MetaworldEnv, VideoEnvMixin):
     """Recovery scenarios on Meta-World."""
 
     observation_height: int = 480

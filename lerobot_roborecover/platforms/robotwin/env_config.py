@@ -11,8 +11,8 @@ from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import (
-    FilmedEnvConfig,
     SimulatorSetup,
+    VideoEnvMixin,
     first_camera,
     no_video,
     refuse_unused,
@@ -27,7 +27,7 @@ from lerobot_roborecover.platforms.robotwin.processors import (
 
 
 @dataclass
-class RobotwinConfig(RoboTwinEnvConfig, FilmedEnvConfig):
+class RobotwinConfig(RoboTwinEnvConfig, VideoEnvMixin):
     """Recovery scenarios on RoboTwin 2.0."""
 
     robotwin_root: str = ""

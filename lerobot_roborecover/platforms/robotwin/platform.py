@@ -129,7 +129,7 @@ class RobotwinPlatform(Platform):
             *checks.check_planners(),
         ]
 
-    def salt(self, options: Mapping[str, Any]) -> dict[str, str | None]:
+    def environment_fingerprint(self, options: Mapping[str, Any]) -> dict[str, str | None]:
         """The checkout."""
         return {"robotwin_root": options.get("robotwin_root"), ROOT_VARIABLE: os.environ.get(ROOT_VARIABLE)}
 

@@ -1,1 +1,0 @@
-"""Detectors, measured side by side on trials of the policy that they watch."""

@@ -1,0 +1,1 @@
+"""Detectors of failures: training data, evaluation on recorded trials, counterfactual rollouts (`fork`)."""

@@ -1,0 +1,140 @@
+"""Logged trials that were forked, and what stepping in gained at each fork: what `recovery_gain` learns."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.analysis.fork_gain import ForkPair, fork_gains
+from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial
+from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.datasets.trajectories import ScenarioLink
+from lerobot_roborecover.detection.trials import ReplayedTrial, TrialSource, look_at
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
+from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.scenario import ScenarioError
+
+
+@dataclass(frozen=True)
+class ForkedTrial:
+    """One trial, continued from several of its steps."""
+
+    row: TrialRow
+    """Of its last continuation, which up to the last fork is the trial itself."""
+    gains: Mapping[int, float]
+    """By step from the handoff: success when somebody steps in, less success when the policy goes on; over
+    random streams the mean."""
+
+
+@dataclass(frozen=True)
+class ForkLog:
+    """What a log of `roborecover fork` says of one arm."""
+
+    path: Path
+    arm: str
+    trials: tuple[ForkedTrial, ...]
+
+    @property
+    def links(self) -> list[ScenarioLink]:
+        """Scenarios of the trials."""
+        shas = {t.row.scenario_id: t.row.scenario_sha256 for t in self.trials}
+        return [ScenarioLink(i, sha, "") for i, sha in shas.items()]
+
+
+@dataclass(frozen=True)
+class SeenForks:
+    """A forked trial and what it showed."""
+
+    trial: ReplayedTrial
+    gains: Mapping[int, float]
+    """As of `ForkedTrial`."""
+
+
+def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
+    """Reads a log of forks.
+
+    Args:
+        log: the file, or the folder that `roborecover fork --out` filled.
+        policy: identity of the policy whose trials must have been forked (`policy_metadata`).
+        arm: label of the arm, or how it begins; empty where the log has one.
+
+    Raises:
+        MonitorError: it is not there, is of another policy, or the arm is not one of its.
+        ScenarioError, TrialLogError: it has no forks, or is damaged.
+    """
+    path = log / TRIALS_FILE if log.is_dir() else log
+    if not path.is_file():
+        raise MonitorError(f"--forks {log}: no log there; `roborecover fork --out {log}` writes one")
+    gains = fork_gains(read_trial_log(path))
+    arms = [a for a in gains.arms if a == arm] or [a for a in gains.arms if a.startswith(arm)]
+    if len(arms) != 1:
+        raise MonitorError(
+            f"--forks {log}: {'no' if not arms else 'more than one'} arm begins with {arm!r}; it has "
+            f"{', '.join(gains.arms)}. Name one: recovery_gain,arm=..."
+        )
+    pairs = [p for p in gains.pairs if p.note.arm == arms[0]]
+    others = sorted({p.continued.policy for p in pairs} - {policy})
+    if others:
+        raise MonitorError(
+            f"--forks {log}: forks of {others[0]}, and the policy that is watched is {policy}. Fork its own "
+            "trials"
+        )
+    settings = {digest_of(p.continued.policy_settings) for p in pairs}
+    if len(settings) > 1:
+        raise MonitorError(
+            f"--forks {log}: forks of {policy} under {len(settings)} settings of its own, which would be "
+            "mixed. Keep one in a log"
+        )
+    by_trial: dict[tuple, list[ForkPair]] = defaultdict(list)
+    for p in pairs:
+        by_trial[p.row.scenario_id, p.row.start, p.row.trial, p.note.of].append(p)
+    return ForkLog(path, arms[0], tuple(map(_forked, by_trial.values())))
+
+
+def see_forks(
+    log: ForkLog, source: TrialSource, env_batch: Any, progress: Callable[[str, int, int], None]
+) -> list[SeenForks]:
+    """Replays forked trials to see what they showed.
+
+    Args:
+        log: of the watched policy.
+        source: whose scenarios, observations and working folder they share.
+        env_batch: as of `replay_trials`.
+        progress: told of what, how many are done, of how many.
+
+    Raises:
+        ScenarioError: scenarios are not those of the set, or actions are missing.
+    """
+    scenarios = load_scenarios(source.scenarios, revision=source.revision)
+    by_id = {s.id: s for s in scenarios}
+    for link in log.links:
+        if link.id not in by_id or by_id[link.id].sha256() != link.sha256:
+            raise ScenarioError(
+                f"--forks {log.path}: {link.id} is not in {source.scenarios} as it was forked; fork trials "
+                "of this set"
+            )
+    found = []
+    for start in sorted({t.row.start for t in log.trials}):
+        mine = [t for t in log.trials if t.row.start == start]
+        options = source.env_config(scenarios.platform, "", start).run_spec().slot.options
+        folder = log.path.with_name(ACTIONS_FOLDER)
+        played = [(by_id[t.row.scenario_id], PolicyTrial(t.row, read_actions(folder, t.row))) for t in mine]
+        seen = look_at(played, scenarios.platform, options, source, env_batch, f"forks, {start}", progress)
+        found += [SeenForks(trial, t.gains) for trial, t in zip(seen, mine, strict=True)]
+    return found
+
+
+def _forked(pairs: Sequence[ForkPair]) -> ForkedTrial:
+    by_step: dict[int, list[float]] = defaultdict(list)
+    for p in pairs:
+        by_step[p.note.step].append(p.difference)
+    last = max(pairs, key=lambda p: p.note.step)
+    return ForkedTrial(last.continued, {step: float(np.mean(d)) for step, d in sorted(by_step.items())})

@@ -1,0 +1,217 @@
+"""Trials of one policy, from recovery points and from the same tasks' first states, and what each of their
+steps showed.
+
+Trials are run as `roborecover eval` runs them, and replayed to look at every step; both are kept in a working
+folder, so that a rerun goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, run_trials
+from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.datasets.rendered_steps import RenderJob, replayed
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.scenario import Outcome, Scenario
+from lerobot_roborecover.utils.atomic_io import atomic_file
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
+
+STARTS = ("recovery", "initial")
+_AT_ONCE = 256
+"""Observations that go through the env preprocessor together."""
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """Which trials."""
+
+    scenarios: str
+    """Scenario set: folder, Hub id or shipped name."""
+    policy: str
+    """Checkpoint that acts."""
+    work: Path
+    """Folder of trials and observations."""
+    revision: str | None = None
+    select: str = ""
+    env: Sequence[str] = ()
+    """`NAME=VALUE` options of the recovery env type."""
+    trials: int = 1
+    """Of each scenario, from each start."""
+    run_seed: int = 1000
+    device: str | None = None
+    workers: int = 1
+    slots: int = 0
+
+    def env_options(self, split: str, start: str) -> list[str]:
+        """Options of the env type for trials of a split from a start."""
+        found = [f"--split={split}", f"--start={start}", *(f"--{o}" for o in self.env)]
+        found += [f"--select={self.select}"] if self.select else []
+        return found + ([f"--revision={self.revision}"] if self.revision else [])
+
+    def env_config(self, platform: str, split: str, start: str) -> RecoveryEnvConfig:
+        """What is observed."""
+        return env_config(platform, self.scenarios, self.env_options(split, start))
+
+
+@dataclass(frozen=True)
+class ReplayedTrial:
+    """A trial and what its steps showed."""
+
+    row: TrialRow
+    scenario: Scenario
+    actions: np.ndarray
+    """(steps, A) of the policy."""
+    handoff: int
+    """Actions replayed before the policy took over."""
+    control_hz: float
+    observations: Mapping[str, np.ndarray]
+    """(T, ...) by LeRobot key, as they leave the env preprocessor, of each step before its action, replayed
+    ones first; pictures (T, 3, H, W) uint8."""
+
+    @property
+    def unit(self) -> str:
+        """Label of what is independent: the first state, which scenarios share that branch off from it."""
+        return self.scenario.first_state_sha256()
+
+    @property
+    def segments(self) -> tuple[slice, ...]:
+        """Stretches that are watched on their own: what was replayed, and what the policy did. A detector
+        begins anew at the handoff, as it does in use."""
+        parts = (slice(0, self.handoff), slice(self.handoff, self.handoff + len(self.actions)))
+        return tuple(p for p in parts if p.stop > p.start)
+
+
+def replay_trials(
+    source: TrialSource, split: str, env_batch: Any, progress: Callable[[str, int, int], None]
+) -> tuple[list[ReplayedTrial], Counter]:
+    """Runs and replays trials of a split from both starts.
+
+    Args:
+        source: which.
+        split: of the set.
+        env_batch: a policy host's, which makes LeRobot's batches of raw observations.
+        progress: told of what, how many are done, of how many.
+
+    Returns:
+        Trials in the order of their scenarios, and how many were left out, by reason.
+
+    Raises:
+        OptionError, ScenarioError, SimulatorError, TrialLogError: what `roborecover eval` refuses.
+    """
+    scenarios = load_scenarios(source.scenarios, revision=source.revision, split=split, select=source.select)
+    by_id = {s.id: s for s in scenarios}
+    dropped: Counter = Counter()
+    found = []
+    for start in STARTS:
+        config = source.env_config(scenarios.platform, split, start)
+        options = config.run_spec().slot.options
+        trials = run_trials(
+            source.policy,
+            config,
+            source.work / f"{split}-{start}",
+            trials=source.trials,
+            seed=source.run_seed,
+            device=source.device,
+            slots=source.slots,
+            on_row=lambda row, done, total, start=start: progress(f"{split}, {start}", done, total),
+        )
+        usable = []
+        for trial in trials:
+            if not Outcome(trial.row.outcome).valid or not len(trial.actions):
+                dropped[f"{split}, {start}: {trial.row.outcome}"] += 1
+            else:
+                usable.append((by_id[trial.row.scenario_id], trial))
+        found += look_at(
+            usable, scenarios.platform, options, source, env_batch, f"{split}, {start}", progress
+        )
+    return found, dropped
+
+
+def look_at(
+    trials: Sequence[tuple[Scenario, PolicyTrial]],
+    platform: str,
+    options: Mapping[str, Any],
+    source: TrialSource,
+    env_batch: Any,
+    what: str,
+    progress: Callable[[str, int, int], None],
+) -> list[ReplayedTrial]:
+    """Replays trials, of which each step is kept in the working folder.
+
+    Args:
+        trials: with their scenarios.
+        platform: of all of them.
+        options: of the simulator.
+        source: working folder and processes.
+        env_batch: as of `replay_trials`.
+        what: they are, in the words of the progress.
+        progress: as of `replay_trials`.
+    """
+    one = make_simulator(platform, **options)
+    control_hz = one.control_hz
+    one.close()
+    folder = source.work / "observations"
+    files = [folder / f"{_key(s, t.row, options)}.npz" for s, t in trials]
+    todo = [i for i, file in enumerate(files) if not file.is_file()]
+    # Trials of a task together: a simulator compiles each task once.
+    todo.sort(key=lambda i: (trials[i][0].task.suite, trials[i][0].task.name, trials[i][0].id))
+    jobs = []
+    for i in todo:
+        scenario, trial = trials[i]
+        first = trial.row.handoff_step
+        jobs.append(RenderJob(scenario, trial.actions, np.arange(first + len(trial.actions)), first))
+    done = len(trials) - len(todo)
+    if jobs:
+        for i, film in zip(todo, replayed(jobs, options, source.workers), strict=True):
+            if film.succeeded != trials[i][1].row.success:
+                raise RuntimeError(
+                    f"{trials[i][0].id}: its replay ends otherwise than the trial; the simulator is not exact"
+                )
+            _keep(files[i], film.observations, trials[i][0].task.instruction, env_batch)
+            done += 1
+            progress(f"{what}: looking", done, len(trials))
+    made = []
+    for (scenario, trial), file in zip(trials, files, strict=True):
+        with np.load(file, allow_pickle=False) as saved:
+            observations = {key: saved[key] for key in saved.files}
+        made.append(
+            ReplayedTrial(
+                trial.row, scenario, trial.actions, trial.row.handoff_step, control_hz, observations
+            )
+        )
+    return made
+
+
+def _key(scenario: Scenario, row: TrialRow, options: Mapping[str, Any]) -> str:
+    what = [scenario.sha256(), row.start, row.handoff_step, row.actions_sha256, dict(options)]
+    return hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def _keep(file: Path, raw: Sequence[Any], instruction: str, env_batch: Any) -> None:
+    """Writes observations as LeRobot's batches hold them; pictures in bytes, which they came from."""
+    import torch
+
+    parts = []
+    for at in range(0, len(raw), _AT_ONCE):
+        chunk = raw[at : at + _AT_ONCE]
+        batch = env_batch(chunk, [instruction] * len(chunk))
+        parts.append({k: v for k, v in batch.items() if isinstance(v, torch.Tensor)})
+    joined = {k: torch.cat([p[k] for p in parts]).cpu() for k in parts[0] if k.startswith("observation")}
+    arrays = {
+        k: (v * 255).round().to(torch.uint8).numpy() if v.ndim == 4 else v.float().numpy()
+        for k, v in joined.items()
+    }
+    with atomic_file(file) as temporary, open(temporary, "wb") as out:
+        np.savez_compressed(out, **arrays)

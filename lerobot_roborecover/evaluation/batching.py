@@ -1,0 +1,94 @@
+"""How long the trials that wait for a policy wait for others to be asked about with them.
+
+There are two good ways to share a policy. Either whoever is ready is asked about while the others step: two
+halves take turns. Or all are asked about together. With n slots, inferences of l + e b seconds for b
+observations, and s seconds of simulation from an answer to the next question, a round of all takes
+max(s + l + e n / 2, 2 l + e n) by halves and s + l + e n together. So together is better where s < l, and
+halves where s > l, whatever e is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from statistics import linear_regression, quantiles
+
+PATIENCE = 0.5
+"""How long who waits alone waits for half of all, in inferences. Where an inference takes as long for many as
+for few, a batch that begins before its company has come costs the company a whole inference."""
+_MOST_PATIENT_S = 0.25
+_SPREAD = 1.5
+"""Batch sizes of an inference that lie so far apart tell what an observation more costs."""
+_RECENT = 8
+"""Inferences of a size that are remembered, and of any size."""
+_SIMULATIONS = 64
+
+
+class BatchTimer:
+    """Of one replica of the policy.
+
+    Args:
+        least_s: how long a waiting trial may wait for company at least.
+    """
+
+    def __init__(self, least_s: float):
+        self._least_s = least_s
+        self._inferences = deque[float](maxlen=_RECENT)
+        self._by_size: dict[int, deque[float]] = {}
+        self._simulations = deque[tuple[int, float]](maxlen=_SIMULATIONS)
+
+    def inferred(self, batch: int, seconds: float) -> None:
+        """An inference for so many observations took so long."""
+        self._inferences.append(seconds)
+        self._by_size.setdefault(batch, deque(maxlen=_RECENT)).append(seconds)
+
+    def simulated(self, together: int, seconds: float) -> None:
+        """A simulator took so long to execute an answer, while those of so many trials began at once."""
+        self._simulations.append((together, seconds))
+
+    def ask_at(
+        self, waiting: Sequence[float], acting: Sequence[float], handing_off: int, limit: int
+    ) -> float:
+        """When the replica is to be asked at the latest, on the engine's clock.
+
+        Args:
+            waiting: since when each trial waits; at least one.
+            acting: since when each simulator executes an answer.
+            handing_off: trials whose start is being rebuilt.
+            limit: most observations in a batch.
+
+        Returns:
+            A time that is past where nobody is worth waiting for.
+        """
+        first, everybody = min(waiting), len(waiting) + len(acting)
+        if len(waiting) >= limit or not (acting or handing_off):
+            return first
+        if acting and limit >= everybody:
+            round_s = self._simulation_s(everybody)
+            if round_s is not None and round_s <= self._fixed_s():
+                return max(acting) + round_s + self._least_s  # what a reply takes on its way, too
+        if len(waiting) >= min(limit, max((everybody + handing_off) // 2, 1)):
+            return first
+        return first + self.delay_s
+
+    @property
+    def delay_s(self) -> float:
+        """How long a trial waits for half of all."""
+        # The shortest of the last inferences: the first ones compile.
+        usual_s = min(self._inferences, default=0.0)
+        return max(self._least_s, min(PATIENCE * usual_s, _MOST_PATIENT_S))
+
+    def _simulation_s(self, everybody: int) -> float | None:
+        """From an answer to the next question, of nine in ten trials, were so many answered at once: where
+        fewer were, cores may have been free that these would have to share."""
+        times = [seconds * max(1.0, everybody / together) for together, seconds in self._simulations]
+        return quantiles(times, n=10)[-1] if len(times) > 1 else None
+
+    def _fixed_s(self) -> float:
+        """What an inference takes however few it is for. Before batches of different sizes have shown it, all
+        of the shortest: to ask about all together once will show it."""
+        shortest = {size: min(times) for size, times in self._by_size.items() if len(times) > 1}
+        if not shortest or max(shortest) < _SPREAD * min(shortest):
+            return min(self._inferences, default=0.0)
+        _, fixed_s = linear_regression(list(shortest), list(shortest.values()))
+        return fixed_s

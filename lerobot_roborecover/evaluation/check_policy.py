@@ -1,0 +1,410 @@
+"""`roborecover check-policy`: what can go wrong with a policy, found before an hour is spent on it.
+
+The checkpoint is loaded as an evaluation loads it, its description is read, one scenario is handed off in the
+real simulator, and the policy takes a few steps there. What a mistake leaves in names, shapes, statistics and
+pictures is looked for; what only a score can tell is not.
+"""
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation import check_names as names
+from lerobot_roborecover.evaluation import check_numbers as numbers
+from lerobot_roborecover.evaluation.check_findings import (
+    Finding,
+    failure,
+    findings_json,
+    format_findings,
+    ok,
+    warning,
+)
+from lerobot_roborecover.evaluation.loading import load_host
+from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
+from lerobot_roborecover.evaluation.session import EvalSession, create_session
+from lerobot_roborecover.evaluation.sizes import default_slots
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
+from lerobot_roborecover.policies.command_line import run_with_arguments
+from lerobot_roborecover.policies.load_problems import load_remedy
+from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
+from lerobot_roborecover.policies.metadata import policy_metadata
+from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner, WatchedHost
+from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
+
+SHORT = {"--json": "--check.json=true"}
+"""What this command has and `lerobot-eval` does not, by its short name."""
+_RECORDED = 50
+"""Scenarios whose prefixes are compared with the checkpoint's statistics, at most."""
+
+
+@dataclass
+class CheckOptions:
+    """Options of `--check.*`."""
+
+    steps: int = 5
+    """Steps the policy takes in the simulator."""
+    json: bool = False
+    """Print one JSON object in place of the table."""
+
+
+@dataclass
+class CheckPolicyConfig(RecoveryEvalConfig):
+    """`roborecover eval`'s configuration, plus the check's options."""
+
+    check: CheckOptions = field(default_factory=CheckOptions)
+
+
+@dataclass
+class FirstSteps:
+    """What the first steps in the simulator left."""
+
+    observations: list[dict[str, Any]]
+    """Raw, one before each step and one after the last."""
+    actions: np.ndarray
+    """(T, A), as executed."""
+    infer_s: list[float]
+    """Seconds of each inference, the first with whatever it compiles."""
+    reset_s: float
+    step_s: float
+    """Of the simulator, observation included."""
+
+
+def check(cfg: CheckPolicyConfig) -> int:
+    """Runs the checks that a command line asks for; see `main`."""
+    cfg.runner.check()
+    _ = cfg.recovery_env, cfg.given_policy  # refused before anything is loaded
+    if not 1 <= cfg.check.steps <= 1000:
+        raise OptionError(f"--check.steps={cfg.check.steps}: must be from 1 to 1000")
+    with redirect_stdout(sys.stderr):  # LeRobot's loaders print
+        findings = examine(cfg)
+    print(json.dumps(findings_json(findings), indent=2) if cfg.check.json else format_findings(findings))
+    return int(not findings_json(findings)["ok"])
+
+
+def examine(cfg: CheckPolicyConfig) -> list[Finding]:
+    """All checks; those that need what an earlier one did not get are left out.
+
+    Args:
+        cfg: what an evaluation would run with.
+
+    Raises:
+        OptionError, ScenarioError, TrialLogError: see `env.run.create_session`.
+    """
+    config = cfg.given_policy
+    wanted = config.input_features or {}
+    path = config.pretrained_path
+    saved = PreTrainedConfig.from_pretrained(path) if path else None
+    scenarios, run = _open(cfg)
+    width = cfg.env.features["action"].shape[0]
+    findings = [names.check_camera_names(_cameras(cfg))]
+    if saved is not None:
+        findings.append(names.check_action_width(saved, width))
+    run.pool.acquire()
+    try:
+        try:
+            host = load_host(host_spec(cfg))
+        except Exception as err:  # a checkpoint may fail to load in any way
+            return [_not_loaded(err), *findings]
+        watched = WatchedHost(host, run.policy_watchdog_s)
+        run.pool.on_close(watched.close)
+        findings.insert(0, ok("loads", f"{config.type} on {config.device}"))
+        own = (
+            host if isinstance(host, LocalPolicyRunner) else None
+        )  # a composite or remote policy has no such parts
+        if own is not None:
+            policy, pre, post = own.parts
+            if path and not config.use_peft:
+                findings.append(names.check_weights(policy, str(path)))
+            findings.append(names.check_statistics(pre, post, wanted, width))
+        horizons = [s.task.horizon for s in scenarios]
+        findings.append(names.check_horizon(config, run.pool.config.platform, min(horizons)))
+        scenario = min(scenarios, key=lambda s: len(s.prefix))
+        start = _hand_off(run, scenario)
+        if isinstance(start, Finding):
+            return [*findings, start]
+        if own is not None:
+            findings += _look(cfg, own, run, scenarios, scenario, start)
+        steps = _take_steps(cfg, watched, run, scenario, start)
+        if isinstance(steps, Finding):
+            return [*findings, steps]
+        findings.append(numbers.check_executed(steps.actions, run.pool.config.platform))
+        if own is not None:
+            findings.append(_check_states(own, scenario, steps, run.pool.config.platform))
+        findings.append(_check_trials(cfg, watched, scenario, steps.observations[0]))
+        findings += _estimate(cfg, watched, scenarios, scenario, steps)
+        return findings
+    finally:
+        run.pool.release()
+
+
+def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, EvalSession]:
+    """The scenarios and a run whose trial log nobody keeps."""
+    folder = TemporaryFolder("check")
+    log = f"{folder.path}/trials.jsonl"
+    facts = policy_metadata(cfg.policy, rename_map=cfg.rename_map, n_episodes=cfg.eval.n_episodes)
+    options = copy(cfg.recovery_env)
+    options.trial_log = log
+    scenarios, run = create_session(options, options.run_spec(), workers=True, facts=facts)
+    run.pool.on_close(folder.close)
+    return scenarios, run
+
+
+def _cameras(cfg: CheckPolicyConfig) -> dict[str, str]:
+    """The policy's key of each camera."""
+    found = {}
+    for key, feature in cfg.env.features.items():
+        if feature.type is FeatureType.VISUAL:
+            ours = cfg.env.features_map[key]
+            found[key.removeprefix("pixels/")] = cfg.rename_map.get(ours, ours)
+    return found
+
+
+def _not_loaded(err: Exception) -> Finding:
+    text = f"{type(err).__name__}: {err}".splitlines()[0]
+    remedy = load_remedy(err) or "see the message; 'roborecover doctor' checks what is installed"
+    return failure("loads", text, "a policy with its processors", remedy)
+
+
+def _hand_off(run: EvalSession, scenario: Scenario) -> EpisodeStart | Finding:
+    slot = run.pool.slots(1)[0]
+    protocol = run.protocol
+    spec = EpisodeSpec(scenario, protocol.start, protocol.rewind_for(scenario), run.handoff_check)
+    slot.send("reset", spec)
+    reply = slot.receive()
+    if isinstance(reply, SlotFailure):
+        return failure(
+            "simulator", reply.message, f"scenario {scenario.id} handed off",
+            "'roborecover doctor' checks simulators and OpenGL",
+        )  # fmt: skip
+    assert isinstance(reply, EpisodeStart)
+    if reply.handoff.problem is not None:
+        return failure(
+            "simulator", f"{reply.handoff.problem.value}: {reply.handoff.reason}",
+            f"scenario {scenario.id} handed off within 2 mm",
+            "the installed versions or assets differ from those the scenarios were recorded with",
+        )  # fmt: skip
+    return reply
+
+
+def _take_steps(
+    cfg: CheckPolicyConfig, host: PolicyRunner, run: EvalSession, scenario: Scenario, start: EpisodeStart
+) -> FirstSteps | Finding:
+    """A few steps, one action at a time, so that every observation is seen."""
+    slot = run.pool.slots(1)[0]
+    observations, actions, infer_s, step_s = [start.observation], [], [], []
+    width = run.action_width(scenario)
+    history = host.start(cfg.seed)
+    try:
+        while len(actions) < cfg.check.steps:
+            began = time.perf_counter()
+            (chunk,) = host.act([observations[-1]], [scenario.task.instruction], [history])
+            infer_s.append(time.perf_counter() - began)
+            if isinstance(chunk, PolicyError):
+                return failure(
+                    "actions", str(chunk), "a chunk of actions",
+                    "the policy cannot take what the env gives: see the inputs above, and the message",
+                )  # fmt: skip
+            if problem := chunk_problem(scenario, chunk, width):
+                return _refused(problem, width)
+            for action in chunk[: cfg.check.steps - len(actions)]:
+                if problem := action_problem(scenario, action, width):
+                    return _refused(problem, width)
+                slot.send("act", action[None])
+                reply = slot.receive()
+                if isinstance(reply, SlotFailure):
+                    return failure(
+                        "simulator", reply.message, "a step", "'roborecover doctor' checks simulators"
+                    )
+                assert isinstance(reply, ActResult)
+                actions.append(np.asarray(action, dtype=np.float64))
+                step_s.append(reply.seconds)
+                if reply.observation is None:  # the trial is over
+                    break
+                observations.append(reply.observation)
+            else:
+                continue
+            break
+        if len(infer_s) == 1 and len(observations) > 1:  # the first one alone tells little about speed
+            began = time.perf_counter()
+            host.act([observations[-1]], [scenario.task.instruction], [history])
+            infer_s.append(time.perf_counter() - began)
+    finally:
+        host.finish(history)
+    step = statistics.median(step_s)
+    return FirstSteps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
+
+
+def _refused(problem: str, width: int) -> Finding:
+    return failure(
+        "actions", problem, f"{width} finite values",
+        "such an action is never sent to the simulator; every trial would be a policy_error. Check the "
+        "checkpoint's statistics and that it is for this robot",
+    )  # fmt: skip
+
+
+def _look(
+    cfg: CheckPolicyConfig,
+    host: LocalPolicyRunner,
+    run: EvalSession,
+    scenarios: ScenarioSet,
+    scenario: Scenario,
+    start: EpisodeStart,
+) -> list[Finding]:
+    """Inputs, pictures and recorded actions, before the policy is asked for anything."""
+    _, pre, post = host.parts
+    config = cfg.given_policy
+    wanted = config.input_features or {}
+    platform = platform_named(run.pool.config.platform)
+    try:
+        batch = host.env_batch([start.observation], [scenario.task.instruction])
+    except Exception as err:  # a processor may raise anything
+        return [
+            failure(
+                "observation", f"{type(err).__name__}: {err}".splitlines()[0], "LeRobot's observation",
+                "the env's processors cannot read what this env type observes: check --env.obs_type, and for "
+                "X-VLA that the env type is the checkpoint's",
+            )
+        ]  # fmt: skip
+    tensors = {cfg.rename_map.get(k, k): v for k, v in batch.items() if hasattr(v, "shape")}
+    shapes = {k: tuple(v.shape[1:]) for k, v in tensors.items()}
+    found = [
+        names.check_features(wanted, shapes, config.type, bool(cfg.rename_map)),
+    ]
+    in_stats, _ = names.statistics_of(pre)
+    out_stats, _ = names.statistics_of(post)
+    pictures = {k: v[0].float().cpu().numpy() for k, v in tensors.items() if v.ndim == 4 and k in wanted}
+    by_colour = numbers.check_cameras_by_colour({k: p.mean((1, 2)) for k, p in pictures.items()}, in_stats)
+    found += [by_colour] if by_colour else []
+    if platform.images_rotated_180 and pictures and config.type != "xvla":  # it turns the scene camera alone
+        raw = next(iter(start.observation["pixels"].values()))
+        key = next(iter(_cameras(cfg).values()))
+        if key in pictures:
+            found.append(numbers.check_upright(pictures[key], platform.upright(raw), key))
+    chosen = [
+        s for s in list(scenarios)[:_RECORDED] if s.prefix.shape[1] == cfg.env.features["action"].shape[0]
+    ]
+    same_kind = platform.records_control_mode in (None, getattr(cfg.env, "control_mode", None))
+    if chosen and same_kind:
+        recorded = np.concatenate([s.prefix for s in chosen])
+        found.append(numbers.check_recorded_actions(recorded, out_stats.get("action")))
+        turned = any("toggle" in type(s).__name__.lower() for s in post.steps)
+        columns = platform.grippers(recorded.shape[1])
+        if columns:
+            found.append(numbers.check_gripper(recorded, out_stats.get("action"), columns, turned))
+    return found
+
+
+def _check_states(host: LocalPolicyRunner, scenario: Scenario, steps: FirstSteps, platform: str) -> Finding:
+    batch = host.env_batch(steps.observations, [scenario.task.instruction] * len(steps.observations))
+    key = "observation.state"
+    if key not in batch:
+        return ok("states fit the training data", "not checked: the policy gets no robot state")
+    stats, _ = names.statistics_of(host.parts[1])
+    return numbers.check_states(batch[key].float().cpu().numpy(), stats.get(key), platform)
+
+
+def _check_trials(
+    cfg: CheckPolicyConfig, host: PolicyRunner, scenario: Scenario, observation: dict
+) -> Finding:
+    """Whether several trials of a scenario are several trials."""
+    answers = []
+    for trial in range(2):
+        history = host.start((cfg.seed or 0) + trial)
+        (chunk,) = host.act([observation], [scenario.task.instruction], [history])
+        host.finish(history)
+        answers.append(chunk)
+    first, second = answers
+    if cfg.eval.n_episodes == 1 or isinstance(first, PolicyError):
+        return ok("trials", str(cfg.eval.n_episodes))
+    if not isinstance(second, PolicyError) and np.array_equal(first, second):
+        fixed = getattr(cfg.policy, "inference_seed", None)
+        remedy = (
+            "--policy.inference_seed=null draws anew in every trial"
+            if fixed is not None
+            else "a deterministic policy: --eval.n_episodes=1 says as much"
+        )
+        return warning(
+            "trials", f"{cfg.eval.n_episodes} a scenario, and the policy does the same in each",
+            "noise of its own in each trial", remedy,
+        )  # fmt: skip
+    return ok("trials", f"{cfg.eval.n_episodes} a scenario, noise {host.noise(cfg.seed)}")
+
+
+def _estimate(
+    cfg: CheckPolicyConfig, host: PolicyRunner, scenarios: ScenarioSet, scenario: Scenario, steps: FirstSteps
+) -> list[Finding]:
+    """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
+    room = default_slots(str(cfg.given_policy.device), usable_cores(), available_gb())
+    slots = min(cfg.runner.slots or room, len(scenarios) * cfg.eval.n_episodes)
+    batch = min(slots, host.max_batch) if host.batched else 1
+    alone = statistics.median(steps.infer_s[1:] or steps.infer_s)
+    together = alone
+    if batch > 1:
+        histories = [host.start(k) for k in range(batch)]
+        for _ in range(2):  # the second one, in case the first compiles for this batch
+            began = time.perf_counter()
+            host.act([steps.observations[0]] * batch, [scenario.task.instruction] * batch, histories)
+            together = time.perf_counter() - began
+        for history in histories:
+            host.finish(history)
+    trials = len(scenarios) * cfg.eval.n_episodes
+    budget = sum(s.task.horizon for s in scenarios) * cfg.eval.n_episodes
+    horizon = getattr(host, "horizon", 1)
+    policy_s = budget / horizon * together / batch
+    sim_s = (budget * steps.step_s + trials * steps.reset_s) / slots
+    value = (
+        f"{_time(alone)} alone, {_time(together)} for a batch of {batch}; {horizon} actions each"
+        if host.batched
+        else f"{_time(alone)}, one slot at a time, {horizon} action each"
+    )
+    total = max(policy_s, sim_s)
+    busy = "the policy" if policy_s > sim_s else "the simulators"
+    return [
+        ok("inference time", value),
+        ok(
+            "run time",
+            f"at most {_time(total)} on {slots} slots for {len(scenarios)} scenarios x {cfg.eval.n_episodes} "
+            f"trials ({_time(policy_s)} of the policy, {_time(sim_s)} of the simulators; {busy} will be the "
+            f"slower), if every trial ran to its last step. From {len(steps.actions)} steps on this machine",
+        ),
+    ]
+
+
+def _time(seconds: float) -> str:
+    if seconds < 1:
+        return f"{1000 * seconds:.0f} ms"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs with a command line in `lerobot-eval`'s words, and `--json`.
+
+    Args:
+        argv: arguments without the program's and the command's name.
+    """
+    from lerobot_roborecover.policies.command_line import rewrite_env_argument
+
+    init_logging()
+    register_third_party_plugins()
+    long = [SHORT.get(argument, argument) for argument in argv]
+    program, *words = rewrite_env_argument(["roborecover-eval", *long])
+    return run_with_arguments(check, program, words)

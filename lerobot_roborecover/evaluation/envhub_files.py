@@ -1,0 +1,59 @@
+"""Writes the files of an EnvHub repository: `env.py`, which runs, and a card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lerobot_roborecover.datasets.card import render_card, render_text
+from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.envhub import HubScenarios
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.outputs import check_page
+
+
+def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | None = None) -> list[Path]:
+    """Writes the repository's folder; what is in it of other names stays.
+
+    Args:
+        scenarios: as loaded; a set of the Hub is named with the commit that was read.
+        out: the folder; made if need be.
+        repo_id: "org/name" that the environment will have on the Hub.
+        split: that the scenarios were loaded with.
+
+    Raises:
+        OptionError: the id is none, or the set is a folder, which nobody else has.
+        OutputExistsError: `out` holds an `env.py` or a card that this command did not write.
+    """
+    if not HUB_ID.fullmatch(repo_id):
+        raise OptionError(f"--repo-id {repo_id!r:.120}: write it like org/name")
+    if Path(scenarios.source).expanduser().is_dir() and scenarios.revision is None:
+        raise OptionError(
+            f"scenarios {scenarios.source!r:.200}: a folder, which others do not have. Publish it "
+            "(roborecover publish), and name it as org/name"
+        )
+    platform = platform_named(scenarios.platform)
+    offer = HubScenarios(platform.name, scenarios.source, scenarios.revision, split)
+    values = {
+        "platform": offer.platform,
+        "scenarios": offer.scenarios,
+        "revision": offer.revision,
+        "split": offer.split,
+        "total": len(scenarios),
+    }
+    card = render_card(
+        "envhub.md.j2",
+        metadata={"tags": ["LeRobot", "RoboRecover", "robotics", "envhub"], "library_name": "lerobot"},
+        title=repo_id.split("/")[-1],
+        repo_id=repo_id,
+        on_hub=bool(HUB_ID.fullmatch(offer.scenarios)),
+        install=platform.install_command,
+        env_name=platform.env_name or platform.name,
+        **values,
+    )
+    texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}
+    check_page(out, list(texts), lambda page: b"Made by `roborecover envhub`" in page.read_bytes())
+    for name, text in texts.items():
+        atomic_write(out / name, text)
+    return [out / name for name in texts]

@@ -1,0 +1,227 @@
+"""Evaluation as a function: for notebooks, scripts and training loops. `roborecover eval` without the files.
+
+A policy that is handed over as an object comes back as it was: its modules' train and eval modes, the
+process's random states (Python, numpy, torch) and torch's backend switches are put back. What LeRobot's own
+loop would change as well, the queue of actions that a policy keeps for itself, is emptied.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+
+from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig, env_type
+from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
+from lerobot_roborecover.evaluation.loading import HostSpec, load_host, load_processors, policy_config
+from lerobot_roborecover.evaluation.processors import env_processors
+from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.session import create_session
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.policies.identity import object_identity
+from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
+from lerobot_roborecover.policies.metadata import policy_metadata
+from lerobot_roborecover.policies.runner import PolicyRunner, ProvidesRunner
+from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.utils.text import pluralize
+
+logger = logging.getLogger(__name__)
+
+
+def evaluate(
+    policy: Any,
+    scenarios: str | Path | ScenarioSet | Sequence[Scenario],
+    *,
+    env: Mapping[str, Any] | Any = None,
+    trials: int = 5,
+    seed: int | None = 1000,
+    processors: tuple[Any, Any] | None = None,
+    rename_map: Mapping[str, str] | None = None,
+    device: str | None = None,
+    name: str = "",
+    log: str | Path | None = None,
+    slots: int = 0,
+    max_batch: int = 64,
+    progress: bool = True,
+) -> list[TrialRow]:
+    """Runs a policy on scenarios; simulators in processes of their own, the policy in this one.
+
+    Args:
+        policy: a checkpoint's folder or Hub id; a policy's configuration (`PreTrainedConfig`, which is how an
+            intervention or a remote policy is named); or a LeRobot policy object, e.g. the one in training.
+            Unwrap one that accelerate or DDP has wrapped.
+        scenarios: a shipped set's name, a folder, a Hub id, or what `load_scenarios` gave, or some of it.
+        env: options of the recovery env type by name, as after `--env.` (`{"start": "initial"}`), or its
+            configuration.
+        trials: per scenario.
+        seed: of the run; trial k of a scenario draws from (seed, scenario, k) alone.
+        processors: pre- and postprocessor of a policy object; without, those saved with its checkpoint.
+        rename_map: the environment's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
+        device: of a policy that is loaded here; None takes what its configuration says.
+        name: of the policy in the rows, whose settings then hold its identity. Default: a checkpoint's
+            identity, or an object's type and a hash of its weights, configuration and processors.
+        log: trial log to write to; trials that it holds already are not run again. None keeps none.
+        slots: simulators at once; 0 takes what `roborecover eval` would.
+        max_batch: observations per inference, at most.
+        progress: show a line with trials, success so far and time left.
+
+    Returns:
+        A row per trial, in the order of the scenarios; see `TrialRow` for its fields. Trials that could not
+        be run, because the policy could not be reached or hung, have none, and a warning says why.
+
+    Raises:
+        OptionError: an option, or the policy, cannot be used.
+        ScenarioError: the scenarios cannot be loaded, or are of several platforms.
+        SimulatorError: no simulator can be made.
+        TrialLogError: the log is damaged or in use.
+    """
+    if trials < 1:
+        raise OptionError(f"trials={trials}: must be 1 or more")
+    chosen = _scenario_set(scenarios, env)
+    options = _env_config(env, chosen.platform)
+    module: PreTrainedPolicy | None = policy if isinstance(policy, torch.nn.Module) else None
+    with TemporaryFolder("evaluate") as folder, untouched(module):
+        options.trial_log = str(log or folder / "trials.jsonl")
+        config = _policy_config(policy, device)
+        spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
+        own = () if module is None else _processors(spec, module, processors)
+        identity = "" if module is None else object_identity(module, own)
+        facts = policy_metadata(
+            config, policy=name, identity=identity, rename_map=rename_map, n_episodes=trials
+        )
+        chosen, run = create_session(options, options.run_spec(), workers=True, facts=facts, scenarios=chosen)
+        run.protocol = replace(run.protocol, run_seed=seed)
+        run.pool.acquire()
+        try:
+            units = units_of(sorted(chosen, key=lambda s: s.id), trials)
+            tally = RunProgress(run.protocol.start, chosen.ids, trials)
+            tally.add([asdict(r) for r in run.rows()])
+            line = ProgressLine(run.protocol.start, detailed=True) if progress else None
+
+            def show(row: TrialRow) -> None:
+                tally.add([asdict(row)])
+                if line is not None:
+                    line.show(tally)
+
+            if tally.done < tally.total:
+                places = EngineConfig(
+                    slots=slots, device=str(config.device), draws=options.obs_type != "state"
+                )
+                make_host = partial(load_host, spec) if module is None else partial(_host, spec, module, *own)
+                engine = open_engine(run, units, make_host, places, on_row=show)
+                engine.run(units)
+                for (scenario, trial), reason in list(engine.unrun.items())[:1]:
+                    logger.warning(
+                        "%s could not be run, and have no row: trial %d of %s: %s",
+                        pluralize(len(engine.unrun), "trial"), trial, scenario, reason,
+                    )  # fmt: skip
+            if line is not None:
+                line.show(tally, final=True)
+            found = {(r.scenario_id, r.trial): r for r in run.rows()}
+        finally:
+            run.pool.release()
+    return [found[s.id, k] for s in chosen for k in range(trials) if (s.id, k) in found]
+
+
+@contextmanager
+def untouched(policy: torch.nn.Module | None = None) -> Generator[None]:
+    """Puts back what an evaluation changes in a process.
+
+    Args:
+        policy: whose modes to put back.
+    """
+    modes = [] if policy is None else [(module, module.training) for module in policy.modules()]
+    gpus = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
+    python, numpy = random.getstate(), np.random.get_state()
+    threads = torch.get_num_threads()
+    benchmark, tf32 = torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32
+    try:
+        with torch.random.fork_rng(devices=gpus):
+            yield
+    finally:
+        for module, training in modes:
+            module.training = training
+        random.setstate(python)
+        np.random.set_state(numpy)
+        torch.backends.cudnn.benchmark, torch.backends.cuda.matmul.allow_tf32 = benchmark, tf32
+        torch.set_num_threads(threads)
+
+
+def _scenario_set(scenarios: Any, env: Any) -> ScenarioSet:
+    if isinstance(scenarios, ScenarioSet):
+        return scenarios
+    if isinstance(scenarios, str | Path):
+        if env is None or isinstance(env, Mapping):
+            said = {k: (env or {}).get(k) for k in ("revision", "split", "select")}
+        else:
+            said = {k: getattr(env, k) for k in ("revision", "split", "select")}
+        return load_scenarios(
+            str(scenarios), revision=said["revision"], split=said["split"], select=said["select"] or ""
+        )
+    given = tuple(scenarios)
+    if not given or not all(isinstance(s, Scenario) for s in given):
+        raise OptionError(
+            "scenarios: give a shipped set's name, a folder, a Hub id, or scenarios of load_scenarios"
+        )
+    return ScenarioSet(given, "memory", None, {"platform": given[0].platform})
+
+
+def _env_config(env: Mapping[str, Any] | RecoveryEnvConfig | None, platform: str) -> RecoveryEnvConfig:
+    if env is not None and not isinstance(env, Mapping):
+        return copy(env)
+    try:
+        return draccus.decode(env_type(platform), {**platform_named(platform).env_defaults, **(env or {})})
+    except (draccus.utils.DraccusException, ValueError, TypeError) as err:
+        raise OptionError(f"env={dict(env or {})}: {' '.join(str(err).split())}") from None
+
+
+def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
+    if isinstance(policy, str | Path):
+        return policy_config(str(policy), (), device)
+    config = policy if isinstance(policy, PreTrainedConfig) else getattr(policy, "config", None)
+    if not isinstance(config, PreTrainedConfig):
+        raise OptionError(
+            f"policy={type(policy).__name__}: give a checkpoint's folder or Hub id, a LeRobot policy or its "
+            "configuration"
+        )
+    if policy is config:
+        config = copy(config)  # loading fills in the environment's features
+        config.device = device or config.device
+    return config
+
+
+def _processors(
+    spec: HostSpec, module: PreTrainedPolicy, processors: tuple[Any, Any] | None
+) -> tuple[Any, Any]:
+    """A policy object's pre- and postprocessor."""
+    if processors is None and not spec.policy.pretrained_path:
+        raise OptionError(
+            "processors: a policy that was not loaded from a checkpoint needs its pre- and postprocessor, "
+            "which hold the training data's statistics: evaluate(policy, ..., processors=(pre, post))"
+        )
+    return processors or load_processors(module.config, spec)
+
+
+def _host(spec: HostSpec, module: PreTrainedPolicy, before: Any, after: Any) -> PolicyRunner:
+    module.eval()
+    env_pre, env_post = env_processors(spec.env, spec.policy)
+    if isinstance(module, ProvidesRunner):
+        return module.make_host(env_pre, env_post, before, spec.max_batch)
+    return LocalPolicyRunner(module, env_pre, env_post, before, after, spec.max_batch, in_training=True)

@@ -1,0 +1,133 @@
+"""What intervened in a trial, as it was carried out: the row's `interventions`, and how its steps count.
+
+The paper gives a trial S new environment steps; replayed actions do not count. Actions that the policy took
+and a rollback undid were taken: by default they stay counted, so a rollback costs the steps it throws away.
+The other reading gives them back. A trial with a rollback therefore runs on for as many steps as were undone,
+and its row says what happened in them: `solved_in_extra` turns its `horizon` into a success under the other
+reading, and nothing else changes (docs/interventions.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.workers.control_columns import ControlColumns, Controller
+from lerobot_roborecover.workers.messages import RollbackReply
+
+_KINDS = {Controller.CORRECTION: "correction", Controller.HUMAN: "takeover"}
+
+
+@dataclass
+class _Monitor:
+    calls: int = 0
+    unparsable: int = 0
+    seconds: float = 0.0
+    score: float = float("nan")
+    """The last one; of the trigger, once there is one."""
+    highest: float = float("nan")
+    step: int | None = None
+    """Of the trigger."""
+
+
+@dataclass
+class InterventionRecord:
+    """Follows one trial. `steps` are always new environment steps taken so far, undone ones included."""
+
+    undone: int = 0
+    """Steps of the policy that rollbacks threw away."""
+    _monitor: _Monitor = field(default_factory=_Monitor)
+    _entries: list[dict[str, Any]] = field(default_factory=list)
+    _controller: Controller = Controller.BASE
+    _solved: bool = False
+
+    def note(self, directive: ControlColumns, steps: int) -> None:
+        """Takes a directive in, before it is carried out."""
+        acts = bool(directive.rollback) or directive.controller is not self._controller
+        by = "schedule"
+        if directive.asked:
+            self._heard(directive)
+            if acts and self._monitor.step is None:
+                self._monitor.step, by = steps, "monitor"
+        if directive.rollback:
+            self._entries.append({"kind": "rollback", "step": steps, "by": by})
+        elif directive.controller is not self._controller and directive.controller in _KINDS:
+            kind = _KINDS[directive.controller]
+            self._entries.append({"kind": kind, "step": steps, "by": by, "steps": 0})
+        self._controller = directive.controller
+
+    def _heard(self, directive: ControlColumns) -> None:
+        told = self._monitor
+        told.calls += 1
+        told.seconds += directive.monitor_s
+        if math.isnan(directive.score):
+            told.unparsable += 1
+            return
+        if told.step is None:
+            told.score = directive.score
+        told.highest = max(directive.score, directive.score if math.isnan(told.highest) else told.highest)
+
+    def acted(self, directive: ControlColumns) -> None:
+        """Counts an executed action for whoever chose it."""
+        if directive.controller in _KINDS:
+            self._entries[-1]["steps"] += 1
+
+    def rolled_back(self, asked: int, result: RollbackReply) -> None:
+        """Fills in the rollback that was just noted."""
+        self.undone += result.undone
+        self._entries[-1] |= {
+            "asked": asked,
+            "distance": result.distance,
+            "undone": result.undone,
+            "method": result.method,
+            "seconds": round(result.seconds, 4),
+        }
+
+    def add(self, entry: dict[str, Any]) -> None:
+        """Takes in what was done to the trial from outside; has at least `kind` and `step`."""
+        self._entries.append(entry)
+
+    def budget(self, horizon: int) -> int:
+        """Steps after which the trial ends: S, and as many as were undone."""
+        return horizon + self.undone
+
+    def verdict(self, steps: int, horizon: int) -> tuple[Outcome, int]:
+        """Outcome and counted steps of a trial that was solved, or that used its budget up.
+
+        Args:
+            steps: at which it was solved; `budget` or more where it was not.
+            horizon: S.
+        """
+        solved = self._solved
+        if self.undone:
+            last = [e for e in self._entries if e["kind"] == "rollback"][-1]
+            last["extra_steps"] = max(steps - horizon, 0)
+            last["solved_in_extra"] = solved and steps > horizon
+        outcome = Outcome.SUCCESS if solved and steps <= horizon else Outcome.HORIZON
+        return outcome, min(steps, horizon)
+
+    def solved(self) -> None:
+        """The task's predicate holds."""
+        self._solved = True
+
+    def entries(self) -> list[dict[str, Any]]:
+        """The row's `interventions`, the monitor's account first."""
+        told = self._monitor
+        if not told.calls:
+            return list(self._entries)
+        account = {
+            "kind": "monitor",
+            "step": told.step,
+            "calls": told.calls,
+            "unparsable": told.unparsable,
+            "score": _json(told.score),
+            "highest_score": _json(told.highest),
+            "seconds": round(told.seconds, 4),
+        }
+        return [account, *self._entries]
+
+
+def _json(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 6)

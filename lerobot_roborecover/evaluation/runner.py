@@ -1,0 +1,365 @@
+"""`roborecover eval`: LeRobot's own configuration and loaders, an engine, and a table at the end."""
+
+import json
+import logging
+import re
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_roborecover.analysis.summary import format_table, summarise
+from lerobot_roborecover.datasets import ScenarioSet
+from lerobot_roborecover.errors import OptionError, check_seed
+from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
+from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
+from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
+from lerobot_roborecover.evaluation.loading import HostSpec, load_host
+from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
+from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
+from lerobot_roborecover.evaluation.session import EvalSession, create_session
+from lerobot_roborecover.evaluation.videos import VideoRecorder
+from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue
+from lerobot_roborecover.logs.extent import missing
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.trial_log import check_retry
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.policies.command_line import run_with_arguments
+from lerobot_roborecover.policies.metadata import policy_metadata
+from lerobot_roborecover.policies.policy_thread import CallStoppedError
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
+from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.workers.backend import Backend
+
+logger = logging.getLogger(__name__)
+
+ALIASES = {
+    "engine": "runner.engine",
+    "videos": "runner.videos",
+    "limit-seconds": "runner.limit_seconds",
+    "sequential": "runner.sequential",
+    "shard": "env.shard",
+    "retry": "runner.retry",
+}
+"""Short names of options that this command has and `lerobot-eval` does not."""
+
+
+@dataclass
+class RunnerOptions:
+    """Options of `--runner.*`."""
+
+    engine: str = "local"
+    """`local`: this machine; `ray`: a Ray cluster."""
+    slots: int = 0
+    """Simulators at once; 0 takes one per core, and two per core under a policy on a GPU as far as memory
+    allows."""
+    max_batch: int = 64
+    """Slots the policy is asked for at once, at most."""
+    batch_delay_ms: float = 10.0
+    """How long a slot waits for company before the policy is asked for it."""
+    limit_seconds: float = 0.0
+    """Stop cleanly after this long; 0 does not. The same command goes on where it stopped."""
+    videos: int = 0
+    """MP4s to keep under `videos/` in the output directory, at most."""
+    videos_of: str = "failures"
+    """Of which trials: `failures`, `successes`, `all`, or comma-separated scenario ids."""
+    render_device: str = "auto"
+    """Where simulators draw: `auto` (the policy's GPU; on a Ray cluster the GPUs of a simulator's own
+    machine, in turn), `cpu`, or a GPU's number."""
+    ray_address: str = "auto"
+    """A Ray cluster's address; `auto` finds the one this machine belongs to."""
+    replicas: int = 0
+    """Copies of the policy on a Ray cluster; 0 takes one per GPU, or a single one for a policy on the CPU."""
+    sequential: str = ""
+    """A trial log to compare with while the run goes: it stops as soon as the comparison is decided. `alone`
+    compares with nobody, and shows an interval that holds whenever it is looked at."""
+    retry: str = ""
+    """Run trials of these outcomes again (`policy_error,timeout,sim_error`); their old rows are kept beside
+    the trial log, in `<log>.retried.jsonl`."""
+    portable: bool = False
+    """Compute a diffusion policy's noise schedule in float64, so that its roots round alike on every
+    processor; the last bit of its actions then differs from `lerobot-eval`'s."""
+
+    @property
+    def retried(self) -> list[str]:
+        """Outcomes of `retry`."""
+        return [outcome.strip() for outcome in self.retry.split(",") if outcome.strip()]
+
+    @property
+    def workplace(self) -> Backend:
+        """Where the run is."""
+        return Backend(self.engine, self.ray_address, "--runner.", device="--policy.device")
+
+    def check(self) -> None:
+        """Refuses what cannot be used.
+
+        Raises:
+            OptionError: naming the option, its value and what it may be.
+        """
+        self.workplace.check()
+        check_retry(self.retried)
+        for name, low, high in (
+            ("slots", 0, 4096),
+            ("max_batch", 1, 4096),
+            ("batch_delay_ms", 0, 10_000),
+            ("limit_seconds", 0, 10**8),
+            ("videos", 0, 100_000),
+            ("replicas", 0, 4096),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise OptionError(f"--runner.{name}={getattr(self, name)}: must be from {low} to {high}")
+
+
+@dataclass
+class RecoveryEvalConfig(EvalPipelineConfig):
+    """LeRobot's evaluation config, plus the runner's options. `eval.batch_size` is not used."""
+
+    runner: RunnerOptions = field(default_factory=RunnerOptions)
+
+    def __post_init__(self) -> None:
+        if path := parser.get_path_arg("policy"):
+            check_checkpoint(path)
+        super().__post_init__()
+
+    @property
+    def recovery_env(self) -> RecoveryEnvConfig:
+        """`env`.
+
+        Raises:
+            OptionError: it is another kind of environment.
+        """
+        if not isinstance(self.env, RecoveryEnvConfig):
+            raise OptionError(
+                f"--env.type={self.env.type}: not a recovery env type; use roborecover_libero, say"
+            )
+        return self.env
+
+    @property
+    def given_policy(self) -> PreTrainedConfig:
+        """`policy`.
+
+        Raises:
+            OptionError: there is none.
+        """
+        if self.policy is None:
+            raise OptionError("no policy: give a checkpoint with --policy.path=FOLDER_OR_HUB_ID")
+        return self.policy
+
+    @property
+    def folder(self) -> Path:
+        """`output_dir`."""
+        assert self.output_dir is not None, "LeRobot sets it where nobody did"
+        return Path(self.output_dir)
+
+
+class StopCondition:
+    """Says when to stop: after a time limit, or at the first Ctrl-C, SIGTERM or SIGHUP. A second one of the
+    same kind ends the process at once.
+
+    Args:
+        limit_s: seconds from now; 0 for none.
+    """
+
+    def __init__(self, limit_s: float):
+        self._deadline = time.monotonic() + limit_s if limit_s else float("inf")
+        self.reason = ""
+        self.status = 0
+        """Exit status of a run that stopped before its end."""
+        self._before = handle(STOP_SIGNALS, self._interrupt)
+
+    def _interrupt(self, number: int, _frame: object) -> None:
+        self.reason, self.status = "interrupted", exit_status(number)
+        put_back({number: self._before.pop(number)})
+
+    def __call__(self) -> bool:
+        """Whether to stop; `reason` then says why."""
+        if not self.reason and time.monotonic() >= self._deadline:
+            self.reason = "time limit reached"
+        return bool(self.reason)
+
+    def restore(self) -> None:
+        """Puts the caller's own signal handlers back."""
+        put_back(self._before)
+
+
+def evaluate(cfg: RecoveryEvalConfig) -> int:
+    """Runs the evaluation that a command line asks for; see `main`."""
+    cfg.runner.check()
+    check_seed(cfg.seed)
+    env, policy = cfg.recovery_env, cfg.given_policy
+    if cfg.eval.recording:
+        raise OptionError(
+            "--eval.recording=true: roborecover eval records no dataset. Use lerobot-eval for that, or "
+            "--videos=N for films"
+        )
+    out = cfg.folder
+    facts = policy_metadata(
+        policy,
+        rename_map=cfg.rename_map,
+        portable=cfg.runner.portable,
+        n_episodes=cfg.eval.n_episodes,
+        output_dir=out,
+    )
+    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts)
+    log = run.require_log()
+    run.protocol = replace(run.protocol, run_seed=cfg.seed)
+    if not run.rows():
+        check_eval_info(out / "eval_info.json", log)
+    if cfg.runner.retried:
+        again, beside = run.retry(cfg.runner.retried)
+        print(f"{pluralize(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)
+    run.pool.acquire()
+    stopper = StopCondition(cfg.runner.limit_seconds)
+    try:
+        watch = open_watch(
+            cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
+            log=log.path, shard=env.shard,
+        )  # fmt: skip
+        order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
+        units = units_of(order, cfg.eval.n_episodes)
+        tally = watch or RunProgress(run.protocol.start, [s.id for s in scenarios], cfg.eval.n_episodes)
+        tally.add([asdict(r) for r in run.rows()])
+        line = ProgressLine(run.protocol.start, detailed=True)
+        line.show(tally)
+
+        def settled() -> bool:
+            if watch is not None and watch.decided and not stopper.reason:
+                stopper.reason = watch.words
+            return watch is not None and watch.decided
+
+        def show(row: TrialRow) -> None:
+            tally.add([asdict(row)])
+            line.show(tally)
+            settled()
+
+        videos, unrun = None, {}
+        if cfg.runner.videos:
+            ids = [s.id for s in scenarios]
+            videos = VideoRecorder(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
+        if watch is not None:
+            watch.record(log.path)
+        if tally.done < tally.total and not settled():
+            options = {
+                "batch_delay_s": cfg.runner.batch_delay_ms / 1e3, "on_row": show, "videos": videos,
+                "queue_of": WorkQueue if watch is None else OrderedQueue,
+            }  # fmt: skip
+            make_host = partial(load_host, host_spec(cfg))
+            with suppress(CallStoppedError):  # the time was up before the policy was loaded
+                engine = open_engine(run, units, make_host, _places(cfg), stop=stopper, **options)
+                engine.run(units, stopper)
+                unrun = engine.unrun
+        line.show(tally, final=True)
+        if watch is not None:
+            record = watch.record(log.path)
+        report(cfg, run, scenarios, [] if videos is None else videos.kept)
+        if watch is not None and record is not None:
+            print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
+            if watch.decided:
+                return 0
+        if stopper.reason:
+            print(
+                f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, run the same "
+                f"command with --env.trial_log={log.path} --output_dir={out}",
+                file=sys.stderr,
+            )
+            return stopper.status
+        if unrun:
+            (scenario, trial), reason = next(iter(unrun.items()))
+            print(
+                f"{pluralize(len(unrun), 'trial')} could not be run, and left no row: the policy was away or "
+                f"hung (trial {trial} of {scenario}: {reason}). To go on, run the same command with "
+                f"--env.trial_log={log.path} --output_dir={out}",
+                file=sys.stderr,
+            )
+            return 1
+        return 0
+    finally:
+        stopper.restore()
+        run.pool.release()
+
+
+def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
+    """The run's policy."""
+    runner = cfg.runner
+    return HostSpec(
+        cfg.given_policy, cfg.recovery_env, cfg.rename_map, cfg.seed, runner.max_batch, runner.portable
+    )
+
+
+def _places(cfg: RecoveryEvalConfig) -> EngineConfig:
+    env, runner = cfg.recovery_env, cfg.runner
+    return EngineConfig(
+        runner.workplace,
+        runner.slots,
+        runner.replicas,
+        str(cfg.given_policy.device),
+        env.obs_type != "state" or bool(runner.videos),
+        runner.render_device,
+        env.snapshot_dir or None,
+    )
+
+
+def report(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, films: Sequence[Path]) -> None:
+    """Writes `eval_info.json` and prints the table.
+
+    Args:
+        cfg: the run's configuration.
+        run: its log.
+        scenarios: what was asked for.
+        films: videos that were kept.
+    """
+    wanted = {s.id for s in scenarios}
+    rows = [r for r in run.rows() if r.scenario_id in wanted and r.trial < cfg.eval.n_episodes]
+    names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in films]
+    videos = {(m[1], int(m[2])): str(p) for m, p in names if m}
+    out = cfg.folder
+    out.mkdir(parents=True, exist_ok=True)
+    info = eval_info(rows, cfg.recovery_env.group_by, videos)
+    atomic_write(out / "eval_info.json", json.dumps(info, indent=2) + "\n")
+    print(format_table(summarise([asdict(r) for r in rows])))
+    if lack := missing(rows):
+        print(f"\nincomplete: {lack.words}")
+    print(f"\ntrial log {run.require_log().path}\neval info {out / 'eval_info.json'}")
+    if films:
+        print(f"videos {films[0].parent} ({len(films)})")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs with a command line in `lerobot-eval`'s words.
+
+    Args:
+        argv: arguments without the program's and the command's name.
+    """
+    from lerobot_roborecover.policies.command_line import rewrite_env_argument
+
+    init_logging()
+    register_third_party_plugins()
+    program, *words = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
+    return run_with_arguments(evaluate, program, words)
+
+
+def _long_names(argv: Sequence[str]) -> list[str]:
+    """All arguments under their long names; `--sequential` without a log is given its value."""
+    found = [_long_name(argument) for argument in argv]
+    for k, name in enumerate(found):
+        if name == "--runner.sequential" and (k + 1 == len(found) or found[k + 1].startswith("--")):
+            found[k] = f"{name}={ALONE}"
+    return found
+
+
+def _long_name(argument: str) -> str:
+    """`--videos=3` as `--runner.videos=3`, and the like."""
+    name, _, value = argument.removeprefix("--").partition("=")
+    if not argument.startswith("--") or name not in ALIASES:
+        return argument
+    return f"--{ALIASES[name]}={value}" if value else f"--{ALIASES[name]}"

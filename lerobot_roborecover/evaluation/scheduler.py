@@ -1,0 +1,379 @@
+"""The engine: every slot busy, policies shared, results in the trial log as they come.
+
+One loop over events. A seat (a slot and the trial it runs) goes round:
+
+    idle -> its trial's states (`trials.trial`), from handing off to over -> idle
+
+Whoever waits is asked about together; a seat whose trial is over takes the next unit at once. While a policy
+infers for some seats the simulators of the others work. Where slots and policies live is the business of the
+parts the engine is given: this process and its children (`local`), or a cluster (`ray_engine`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+from lerobot_roborecover.evaluation.active_trial import ActiveTrial, EngineSlot, WorkerState
+from lerobot_roborecover.evaluation.batching import BatchTimer
+from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.evaluation.trial import Act, Trial
+from lerobot_roborecover.evaluation.videos import VideoRecorder
+from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.policies.action_checks import count_problem
+from lerobot_roborecover.policies.runner import (
+    PolicyError,
+    PolicyUnavailableError,
+    Replica,
+    ReplicaHungError,
+    ReplicaLostError,
+)
+from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, TrialStart
+from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.workers.control_columns import split
+from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackReply, SlotFailure
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS
+
+MAX_CONSECUTIVE_FAILURES = 3
+"""Simulator failures of one scenario in a row after which its other trials are not tried."""
+_POLL_S = 0.5
+"""How often `stop` is asked at least."""
+
+type Waiter = Callable[[list[Any], float], Collection[Any]]
+"""Waits for any of some handles, at most so many seconds; those that are ready."""
+type Event = tuple[Replica | EngineSlot, Callable[[], None]]
+"""Whom to wait for, and what to do then."""
+
+
+class Engine:
+    """Runs units on slots.
+
+    Args:
+        run: protocol (with its run seed), trial log.
+        slots: where simulators live.
+        replicas: the policies.
+        wait: how to wait for slots and replicas.
+        batch_delay_s: how long a waiting slot may wait for company before the policy is asked, at least;
+            where inferences are slow it is longer, see `company`.
+        on_row: called with every finished trial.
+        videos: which trials to film, if any.
+        queue_of: in which order units are handed out.
+        clock: seconds, the one that slots' deadlines are on.
+    """
+
+    def __init__(
+        self,
+        run: EvalSession,
+        slots: Sequence[EngineSlot],
+        replicas: Sequence[Replica],
+        wait: Waiter,
+        *,
+        batch_delay_s: float = 0.01,
+        on_row: Callable[[TrialRow], None] = lambda row: None,
+        videos: VideoRecorder | None = None,
+        queue_of: type[WorkQueue] = WorkQueue,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._clock, self._queue_of = clock, queue_of
+        self._run, self._replicas, self._wait = run, list(replicas), wait
+        self._on_row, self._videos = on_row, videos
+        self._seats = [WorkerState(slot) for slot in slots]
+        self._asked: dict[Replica, tuple[list[ActiveTrial], float]] = {}
+        self._company = {r: BatchTimer(batch_delay_s) for r in self._replicas}
+        self._failures: dict[str, int] = {}
+        self._losses: dict[tuple[str, int], int] = {}
+        self._queue = WorkQueue(())
+        self._finished = 0
+        self.reruns = 0
+        """Trials that were begun again because a machine was lost, or the policy, or the way to it."""
+        self._stop: Callable[[], bool] = lambda: False
+        self.unrun: dict[tuple[str, int], str] = {}
+        """Why trials were left for another run, by scenario and trial: the policy could not be reached, or an
+        inference never ended."""
+
+    def run(self, units: Sequence[WorkItem[TrialStart]], stop: Callable[[], bool] = lambda: False) -> int:
+        """Runs all units that the log does not hold yet.
+
+        Args:
+            units: what to run.
+            stop: asked between events; True starts no new trial and drops those under way.
+
+        Returns:
+            Number of trials finished.
+        """
+        self._queue = self._queue_of(unfinished(self._run, units))
+        self._finished, self._stop = 0, stop
+        while not stop():
+            self._fill()
+            events = self._events()
+            # Whoever has replied meanwhile joins the batch, or takes its next unit, before a policy is asked.
+            if self._collect(events, 0.0) or any(self._ask(r) for r in self._replicas):
+                continue
+            if not events:
+                break
+            self._collect(events, _POLL_S)
+        for sitting in self._sittings():
+            if sitting.recording is not None:
+                sitting.recording.drop()
+        reasons = [r.gone for r in self._replicas if r.gone]
+        if len(reasons) == len(self._replicas) and not stop():
+            while (unit := self._queue.take(None)) is not None:
+                self.unrun[unit.scenario.id, unit.trial] = reasons[0]
+        return self._finished
+
+    def check_all_run(self) -> None:
+        """Checks that no trial was left for another run.
+
+        Raises:
+            ScenarioError: some were; the same command goes on.
+        """
+        if self.unrun:
+            (scenario, trial), reason = next(iter(self.unrun.items()))
+            raise ScenarioError(
+                f"{pluralize(len(self.unrun), 'trial')} could not be run: the policy was away or hung (trial "
+                f"{trial} of {scenario}: {reason}). What has finished is kept: once the policy answers, run "
+                "the same command again"
+            )
+
+    def _sittings(self) -> list[ActiveTrial]:
+        """The trials under way, in the order of their seats."""
+        return [s.sitting for s in self._seats if s.sitting is not None]
+
+    def _sittings_of(self, replica: Replica) -> list[ActiveTrial]:
+        return [s for s in self._sittings() if s.replica is replica]
+
+    # --- events
+
+    def _fill(self) -> None:
+        """Gives the next units to the seats without one."""
+        for seat in self._seats:
+            if seat.sitting is not None or seat.slot.opening:
+                continue
+            replica = self._least_busy()
+            if replica is None:
+                return
+            unit = self._queue.take(seat.last, [s.unit.task for s in self._sittings()])
+            if unit is None:
+                return
+            self._start(seat, unit, replica)
+
+    def _least_busy(self) -> Replica | None:
+        users = [s.replica for s in self._sittings()]
+        able = (r for r in self._replicas if not (r.opening or r.gone))
+        return min(able, key=users.count, default=None)
+
+    def _start(self, seat: WorkerState, unit: WorkItem[TrialStart], replica: Replica) -> None:
+        trial = self._run.trial(unit.scenario, unit.trial)
+        seat.last = unit
+        seat.sitting = ActiveTrial(seat, unit, trial, replica, trial.open_history(replica.host))
+        filmed = self._videos is not None and self._videos.wants(unit)
+        seat.slot.send("reset", trial.begin(filmed))
+
+    def _ask(self, replica: Replica) -> bool:
+        """Asks a free replica about the trials that wait for it, unless more company is to be expected."""
+        at = self._ask_at(replica)
+        if at is None or self._clock() < at:
+            return False
+        waiting = [s for s in self._sittings_of(replica) if s.waiting]
+        asking = sorted(waiting, key=lambda s: s.waiting_since)[: replica.host.max_batch]
+        self._asked[replica] = asking, self._clock()
+        replica.ask(
+            [s.trial.ask() for s in asking],
+            [s.unit.scenario.task.instruction for s in asking],
+            [s.history for s in asking],
+        )
+        return True
+
+    def _ask_at(self, replica: Replica) -> float | None:
+        """When a replica is to be asked; None where nobody waits for it, or it cannot be asked."""
+        if replica.opening or replica in self._asked:
+            return None
+        mine = self._sittings_of(replica)
+        waiting = [s.waiting_since for s in mine if s.waiting]
+        if not waiting:
+            return None
+        acting = [s.answered_at for s in mine if s.working and s.answered_at is not None]
+        handing_off = sum(s.working and s.answered_at is None for s in mine)
+        return self._company[replica].ask_at(waiting, acting, handing_off, replica.host.max_batch)
+
+    def _events(self) -> list[Event]:
+        """What can happen next."""
+        events: list[Event] = []
+        events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
+        events += [(s.seat.slot, lambda s=s: self._replied(s)) for s in self._sittings() if s.working]
+        if len(self._queue):
+            parties = [*self._replicas, *(s.slot for s in self._seats)]
+            events += [(p, p.opened) for p in parties if p.opening]
+        return events
+
+    def _collect(self, events: list[Event], timeout_s: float) -> bool:
+        """Handles the events that are there, or come until the first of them, a deadline, or the end of the
+        batch delay.
+
+        Args:
+            events: what may happen.
+            timeout_s: how long to wait at most.
+
+        Returns:
+            Whether anything happened.
+        """
+        inline = [e for e in events if e[0].ready is True]
+        others = [e for e in events if e[0].ready is not True]
+        arrived = []
+        if others:
+            arrived = self._arrived(others, 0.0 if inline else timeout_s)
+        for _, act in arrived or inline:  # an inference in this process holds everyone up: replies come first
+            act()
+        return bool(arrived or inline)
+
+    def _arrived(self, events: list[Event], timeout_s: float) -> list[Event]:
+        now = self._clock()
+        deadline = min(getattr(party, "deadline", float("inf")) for party, _ in events)
+        timeout_s = min(timeout_s, deadline - now)
+        for replica in self._replicas:
+            if (at := self._ask_at(replica)) is not None:
+                timeout_s = min(timeout_s, at - now)
+        ready = set(map(id, self._wait([p.ready for p, _ in events], max(timeout_s, 0.0))))
+        now = self._clock()
+        return [
+            (party, act)
+            for party, act in events
+            if id(party.ready) in ready or getattr(party, "deadline", float("inf")) <= now
+        ]
+
+    def _answered(self, replica: Replica) -> None:
+        asked, began = self._asked.pop(replica)
+        try:
+            answers = replica.answer(self._stop)
+        except ReplicaLostError as err:
+            if isinstance(err, ReplicaHungError):
+                for sitting in asked:
+                    sitting.trial.refused(err, seconds=self._clock() - began)
+                    sitting.replica = None
+                    self._finish(sitting)
+            for sitting in self._sittings_of(replica):
+                sitting.replica = None
+                if not sitting.working:  # one that works is given up when its slot has replied
+                    self._lost(sitting, str(err))
+            return
+        if answers is None:
+            return
+        if problem := count_problem(len(answers), len(asked)):
+            answers = [PolicyError(problem)] * len(asked)
+        seconds = self._clock() - began
+        self._company[replica].inferred(len(asked), seconds)
+        for sitting, chunk in zip(asked, answers, strict=True):
+            trial, slot = sitting.trial, sitting.seat.slot
+            if isinstance(chunk, PolicyUnavailableError):
+                self._away(sitting, str(chunk))
+                continue
+            if isinstance(chunk, PolicyError):
+                trial.refused(chunk, seconds=seconds)
+            else:
+                actions, directives = split(chunk, self._run.action_width(sitting.unit.scenario))
+                move = trial.decide(actions, directives, seconds=seconds)
+                sitting.answered_at, sitting.answered_with = self._clock(), len(asked)
+                if isinstance(move, Act):
+                    slot.send("act", move.actions)
+                elif move is not None:
+                    slot.send("rollback", move.steps)
+            if trial.over:
+                self._finish(sitting)
+
+    def _replied(self, sitting: ActiveTrial) -> None:
+        reply = sitting.seat.slot.receive()
+        sitting.waiting_since = self._clock()
+        if sitting.replica is None:
+            self._lost(sitting, "the policy's process was lost")
+            return
+        if isinstance(reply, SlotFailure) and reply.kind == "lost":
+            self._lost(sitting, reply.message)
+            return
+        if isinstance(reply, ActResult) and not reply.over:
+            self._company[sitting.replica].simulated(sitting.answered_with, reply.seconds)
+        sitting.trial.take(reply)
+        if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
+            sitting.recording = self._videos.begin(sitting.unit, reply.frame, reply.hz)
+        elif sitting.recording is not None and isinstance(reply, ActResult):
+            sitting.recording.add(reply.frames)
+        elif sitting.recording is not None and isinstance(reply, RollbackReply) and reply.frame is not None:
+            sitting.recording.add((reply.frame,))
+        if sitting.trial.over:
+            self._finish(sitting)
+
+    # --- ends
+
+    def _lost(self, sitting: ActiveTrial, reason: str) -> None:
+        """The trial's machine is gone: it is run again from its start, elsewhere."""
+        if self._lost_again(sitting):
+            sitting.trial.fail(Outcome.SIM_ERROR, f"lost {MAX_ATTEMPTS} times, last: {reason}")
+            self._finish(sitting)
+            return
+        self._run_again(sitting)
+
+    def _away(self, sitting: ActiveTrial, reason: str) -> None:
+        """Nobody could ask the policy, so nothing is known of it: the trial is run again from its start, and
+        in the end left without a row, for a run that finds the policy there."""
+        unit = sitting.unit
+        if self._lost_again(sitting):
+            self.unrun[unit.scenario.id, unit.trial] = reason
+            self._leave(sitting)
+        else:
+            self._run_again(sitting)
+
+    def _lost_again(self, sitting: ActiveTrial) -> bool:
+        """Counts a loss; whether it was one too many."""
+        key = (sitting.unit.scenario.id, sitting.unit.trial)
+        self._losses[key] = self._losses.get(key, 0) + 1
+        return self._losses[key] >= MAX_ATTEMPTS
+
+    def _run_again(self, sitting: ActiveTrial) -> None:
+        self.reruns += 1
+        self._queue.put_back(sitting.unit)
+        self._leave(sitting)
+
+    def _finish(self, sitting: ActiveTrial) -> None:
+        unit, trial = sitting.unit, sitting.trial
+        outcome = trial.verdict()
+        if self._videos is not None and sitting.recording is not None:
+            self._videos.finish(sitting.recording, unit, outcome)
+            sitting.recording = None
+        self._record(trial, sitting.replica or self._replicas[0])
+        self._leave(sitting)
+        broke = outcome in (Outcome.SIM_ERROR, Outcome.TIMEOUT)
+        count = self._failures[unit.scenario.id] = self._failures.get(unit.scenario.id, 0) + 1 if broke else 0
+        if count >= MAX_CONSECUTIVE_FAILURES:
+            for other in self._queue.drop(unit.scenario.id):
+                parked = self._run.trial(other.scenario, other.trial)
+                text = f"not tried: the scenario failed {count} times in a row, last {trial.reason}"
+                parked.fail(outcome, text)
+                self._record(parked, self._replicas[0])
+
+    def _leave(self, sitting: ActiveTrial) -> None:
+        if sitting.replica is not None:
+            sitting.replica.host.finish(sitting.history)
+        if sitting.recording is not None:
+            sitting.recording.drop()
+        sitting.seat.sitting = None
+
+    def _record(self, trial: Trial, replica: Replica) -> None:
+        host = replica.host
+        noise = host.noise(self._run.protocol.run_seed)
+        row = self._run.record(trial, noise=noise, batch_size=host.max_batch if host.batched else 1)
+        self._finished += 1
+        self._on_row(row)
+
+
+def unfinished[S: TrialStart](run: EvalSession, units: Sequence[WorkItem[S]]) -> list[WorkItem[S]]:
+    """Units that the run's trial log does not hold yet."""
+    if run.log is None:
+        return list(units)
+    keys = run.keys([(u.scenario, u.trial) for u in units])
+    return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
+
+
+def units_of(scenarios: Sequence[Scenario], trials: int) -> list[WorkItem[Scenario]]:
+    """All trials of all scenarios."""
+    return [WorkItem(s, k) for s in scenarios for k in range(trials)]

@@ -1,0 +1,400 @@
+"""What all trials of a run share, and how it is opened: everything that can be refused is refused here,
+before a simulator starts.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
+from lerobot_roborecover.datasets.load import validate_for
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.options import POLICY_WATCHDOG_S, RecoveryOptions
+from lerobot_roborecover.evaluation.real_time import RealTime
+from lerobot_roborecover.evaluation.trial import Trial
+from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions
+from lerobot_roborecover.logs.row import EvalProtocol, RunExtent, TrialRow, trial_key
+from lerobot_roborecover.logs.trial_log import RowLog, TrialLog, check_retry
+from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.robot_fingerprint import (
+    NAME,
+    SAME,
+    RobotComparison,
+    compare_robots,
+    is_robot_entry,
+)
+from lerobot_roborecover.platforms.versions import installed, required, version_problems
+from lerobot_roborecover.policies.interventions.options import InterventionFacts
+from lerobot_roborecover.policies.metadata import PolicyMetadata
+from lerobot_roborecover.scenario import Scenario, Start, TrialStart
+from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.workers.messages import SlotConfig
+from lerobot_roborecover.workers.slots import SlotPool
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SimulatorSpec:
+    """What an env type brings to a run, beside the common options."""
+
+    slot: SlotConfig
+    """How workers make their simulator."""
+    decisive: Mapping[str, Any]
+    """Simulator options that decide a result, for the trial rows."""
+    picture: Callable[[dict], np.ndarray] | None
+    """Frame for LeRobot's videos from an observation; None asks the simulator."""
+    assets: Mapping[str, str] = field(default_factory=dict)
+    """Hashes of assets that decide the physics, under the names a fingerprint gives them."""
+
+
+@dataclass
+class EvalSession:
+    """What all scenarios of a run share."""
+
+    pool: SlotPool
+    protocol: EvalProtocol
+    log: RowLog | None
+    """None where nobody keeps the rows."""
+    dataset: str
+    dataset_revision: str | None
+    handoff_check: bool = True
+    extent: RunExtent | None = None
+    """How much the run is to evaluate; None outside of an evaluation."""
+    picture: Callable[[dict], np.ndarray] | None = None
+    """Upright frame (H, W, 3) uint8 of an unbatched observation, for LeRobot's videos; None asks the
+    simulator."""
+    intervention: InterventionFacts | None = None
+    """Of a composite policy."""
+    real_time: RealTime | None = None
+    """None where the simulator waits for the policy."""
+    policy_watchdog_s: float = POLICY_WATCHDOG_S
+    """Longest that one inference may take; infinite where it may take for ever."""
+    keep: Callable[[Trial, TrialRow], None] = lambda trial, row: None
+    """Told of a trial that is over before its row is in the log: what it keeps is there for every row."""
+
+    def action_width(self, scenario: TrialStart) -> int:
+        """Values in a policy's action, which need not be those of the scenario's prefix."""
+        options = self.pool.config.options if self.pool is not None else {}
+        return platform_named(scenario.platform).policy_action_width(options, scenario.prefix.shape[1])
+
+    def rollback_steps(self, scenario: TrialStart) -> int:
+        """How far back the policy may ask to go."""
+        return self.intervention.rollback_steps(scenario) if self.intervention else 0
+
+    def require_log(self) -> RowLog:
+        """The log of a run that has one, as every run of `create_session` does.
+
+        Raises:
+            RuntimeError: it has none.
+        """
+        if self.log is None:
+            raise RuntimeError("this run keeps no trial log")
+        return self.log
+
+    def retry(self, outcomes: Sequence[str]) -> tuple[int, Path]:
+        """Takes the log's trials of these outcomes out, so that they run again.
+
+        Args:
+            outcomes: invalid ones.
+
+        Returns:
+            How many they are, and the file beside the log that keeps their rows.
+        """
+        log = self.require_log()
+        beside = log.path.with_name(f"{log.path.name}.retried.jsonl")
+        if not isinstance(log, TrialLog):
+            raise RuntimeError(f"the rows of {log.path} are kept with things that would not go with them")
+        return log.set_aside(check_retry(outcomes), beside, self.protocol.config_hash()), beside
+
+    def rows(self) -> list[TrialRow]:
+        """The log's rows of this run's protocol."""
+        config_hash = self.protocol.config_hash()
+        return [] if self.log is None else [r for r in self.log.rows if r.config_hash == config_hash]
+
+    def keys(self, trials: Sequence[tuple[TrialStart, int]]) -> list[tuple]:
+        """What the log knows trials by: scenarios, and k."""
+        hash_ = self.protocol.config_hash()
+        return [trial_key(scenario.sha256(), scenario.id, hash_, k) for scenario, k in trials]
+
+    def trial(self, scenario: TrialStart, index: int, protocol: EvalProtocol | None = None) -> Trial:
+        """A trial of the run, not begun.
+
+        Args:
+            scenario: one of the run's.
+            index: k.
+            protocol: in place of the run's own, for a loop that learns its seed late.
+        """
+        return Trial(
+            scenario,
+            index,
+            protocol or self.protocol,
+            action_width=self.action_width(scenario),
+            handoff_check=self.handoff_check,
+            rollback_steps=self.rollback_steps(scenario),
+            real_time=self.real_time,
+        )
+
+    def record(self, trial: Trial, *, noise: str, batch_size: int) -> TrialRow:
+        """The row of a trial that is over, on disk before this returns; arguments as `Trial.row`."""
+        row = trial.row(
+            dataset=self.dataset,
+            dataset_revision=self.dataset_revision,
+            noise=noise,
+            batch_size=batch_size,
+            extent=self.extent,
+        )
+        self.keep(trial, row)
+        if self.log is not None:
+            self.log.append(row)
+        return row
+
+
+def create_session(
+    options: RecoveryOptions,
+    spec: SimulatorSpec,
+    *,
+    workers: bool,
+    facts: PolicyMetadata | None = None,
+    scenarios: ScenarioSet | None = None,
+) -> tuple[ScenarioSet, EvalSession]:
+    """Checks everything, loads the scenarios and opens the trial log; no simulator starts yet.
+
+    Args:
+        options: the env type's options.
+        spec: what the env type adds.
+        workers: simulators in processes of their own, or in this one.
+        facts: who is evaluated, and how much of it.
+        scenarios: what to run in place of those that the options name.
+
+    Raises:
+        OptionError: an option, or the batch size, cannot be used.
+        ScenarioError: the scenarios cannot be loaded, are of another platform, or none is selected.
+        TrialLogError: the trial log is damaged or in use.
+    """
+    options.check()
+    facts = facts or PolicyMetadata()
+    _check_batch(facts)
+    platform = spec.slot.platform
+    scenarios = _load(options, platform) if scenarios is None else scenarios
+    selected = len(scenarios)
+    scenarios = _of_this_run(scenarios, options, platform)
+    _check_versions(scenarios, platform, spec.assets, options.strict_versions)
+    start = Start(options.start)
+    decisive = {**spec.decisive, "handoff_check": options.handoff_check}
+    if start is Start.REVERSION and options.rewind_steps is None:
+        decisive["rewind_rule"] = "paper"
+    if facts.intervention is not None:
+        _check_intervention(facts.intervention, start)
+        decisive |= facts.intervention.options()
+    real_time = _real_time(options, facts)
+    if real_time is not None:
+        decisive |= real_time.decisive()
+    protocol = EvalProtocol(
+        start=start.value,
+        rewind_steps=options.rewind_steps if start is Start.REVERSION else 0,
+        policy=facts.policy,
+        run_seed=None,
+        execution_horizon=facts.execution_horizon,
+        policy_settings=facts.policy_settings,
+        options=decisive,
+        versions={name: installed(name) or "" for name in required(platform)},
+    )
+    log = TrialLog(options.trial_log_path(facts.output_dir))
+    trials = "" if facts.n_episodes is None else f", {facts.n_episodes} trials each"
+    logger.info(
+        "RoboRecover: %d scenarios of %s%s from %s; trial log %s (%d rows already there)",
+        len(scenarios), scenarios.source, trials, start.value, log.path, len(log),
+    )  # fmt: skip
+    for remark in log.other_rows(protocol):
+        logger.warning("%s", remark)
+    if log.dropped_bytes:
+        logger.warning("dropped a last line of %d bytes that a crash had cut off", log.dropped_bytes)
+    folder, shared = options.snapshot_dir, None
+    if not folder:
+        shared = TemporaryFolder("snapshots")
+        folder = str(shared.path)
+    pool = SlotPool(replace(spec.slot, snapshot_dir=folder), workers=workers, timeout_s=options.watchdog_s)
+    if shared is not None:
+        pool.on_close(shared.close)
+    pool.on_close(log.close)
+    run = EvalSession(
+        pool=pool,
+        protocol=protocol,
+        log=log,
+        dataset=scenarios.source,
+        dataset_revision=scenarios.revision,
+        handoff_check=options.handoff_check,
+        extent=RunExtent(selected, facts.n_episodes, "{}/{}".format(*options.shard_of())),
+        picture=spec.picture,
+        intervention=facts.intervention,
+        real_time=real_time,
+        policy_watchdog_s=options.policy_watchdog_s or float("inf"),
+    )
+    if options.record_actions:
+        folder = log.path.with_name(ACTIONS_FOLDER)
+        run.keep = lambda trial, row: put_actions(folder, trial.actions, row)
+    return scenarios, run
+
+
+def _real_time(options: RecoveryOptions, facts: PolicyMetadata) -> RealTime | None:
+    if not options.realtime:
+        return None
+    if facts.intervention is not None:
+        raise OptionError(
+            f"--env.realtime=true with --policy.mode={facts.intervention.mode}: interventions take the "
+            "frozen clock; leave one of the two out"
+        )
+    if facts.execution_horizon is None:
+        raise OptionError(
+            "--env.realtime=true charges inferences, and nothing says how many actions one gives: name "
+            "--policy.n_action_steps"
+        )
+    return RealTime(options.meanwhile, options.latency_s, facts.execution_horizon)
+
+
+def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:
+    scenarios, split = platform_named(platform).evaluated(options.scenarios, options.split)
+    return load_scenarios(scenarios, revision=options.revision, split=split, select=options.select)
+
+
+def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str) -> ScenarioSet:
+    """The shard's part, without pictures."""
+    validate_for(scenarios, platform)
+    k, n = options.shard_of()
+    part = scenarios.shard(k, n)
+    if not len(part):
+        raise OptionError(
+            f"--env.shard={options.shard} is empty: {len(scenarios)} scenarios cannot fill {n} shards. "
+            f"Use at most {len(scenarios)}"
+        )
+    return replace(part, scenarios=tuple(map(_without_pictures, part)))
+
+
+def _without_pictures(scenario: Scenario) -> Scenario:
+    """Nobody looks at recorded frames in a run: they would fill its memory and travel to every worker."""
+    mark = scenario.fingerprint
+    return scenario if mark is None else replace(scenario, fingerprint=replace(mark, frames_png=()))
+
+
+def _check_intervention(facts: InterventionFacts, start: Start) -> None:
+    if facts.mode == "reversion" and start is not Start.RECOVERY:
+        where = "is at the task's start" if start is Start.INITIAL else "goes back itself"
+        raise OptionError(
+            f"--policy.mode=reversion with --env.start={start.value}: a rewind beyond the start; this start "
+            f"{where}. Use --env.start=recovery"
+        )
+
+
+def group_name(row: TrialRow, by: str) -> str:
+    """Name of a trial's group in `eval_info.json`."""
+    if by == "cell":
+        return _cell_name(row.stage, row.deviation)
+    return row.source if by == "source" else row.suite
+
+
+def scenario_group(scenario: Scenario, by: str) -> str:
+    """Name of the group that a scenario's trials will be in."""
+    if by == "cell":
+        return _cell_name(scenario.stage, scenario.deviation)
+    return scenario.source.value if by == "source" else scenario.task.suite
+
+
+def _cell_name(stage: str, deviation: str) -> str:
+    """A cell's name without spaces: LeRobot makes folders of group names."""
+    return f"{stage}-{deviation}".replace(" ", "_")
+
+
+_ONE_ENVIRONMENT = ("lingbot_va",)
+"""Policies that LeRobot's own evaluator can ask about one environment at a time only
+(`modeling_lingbot_va.py`, "single-environment eval")."""
+
+
+def _check_batch(facts: PolicyMetadata) -> None:
+    """Refuses a batch that does not divide the trials, of which LeRobot would run extra ones and drop them,
+    and a batch for a policy that keeps the history of one environment."""
+    if facts.policy_type in _ONE_ENVIRONMENT and facts.batch_size not in (None, 1) and facts.n_episodes != 1:
+        raise OptionError(
+            f"--eval.batch_size={facts.batch_size}: LeRobot's {facts.policy_type} keeps the "
+            "history of one environment. Use --eval.batch_size=1, or roborecover eval, which gives every "
+            "slot an instance that shares the weights"
+        )
+    if facts.lerobots_batch:
+        return  # nobody asked for it, and the trials beyond the number cost no simulator
+    if facts.n_episodes and facts.batch_size and facts.n_episodes % facts.batch_size:
+        divisors = [d for d in range(1, facts.n_episodes + 1) if facts.n_episodes % d == 0]
+        if facts.batch_size > facts.n_episodes:
+            return  # LeRobot lowers it to the number of episodes
+        raise OptionError(
+            f"--eval.batch_size={facts.batch_size} does not divide --eval.n_episodes={facts.n_episodes}. "
+            f"Use one of {divisors}"
+        )
+
+
+def _robot_problems(scenarios: ScenarioSet, assets: Mapping[str, str]) -> list[str]:
+    """One sentence for each other robot that scenarios were recorded on; lesser differences are logged."""
+    if not any(is_robot_entry(name) for name in assets):
+        return []
+    found: dict[RobotComparison, list[str]] = {}
+    for scenario in scenarios:
+        if scenario.fingerprint is not None:
+            robots = compare_robots(scenario.fingerprint.versions, assets)
+            if robots != SAME:
+                found.setdefault(robots, []).append(scenario.id)
+    name, problems = assets.get(NAME, "robot"), []
+    for robots, ids in found.items():
+        others = f" (and {len(ids) - 1} more)" if len(ids) > 1 else ""
+        if not robots.known:
+            logger.warning(
+                "scenario %s%s does not say which robot recorded it; if that was another one, its handoff "
+                "ends as state_mismatch. Record it again to have the robots compared",
+                ids[0],
+                others,
+            )
+            continue
+        text = f"scenario {ids[0]}{others} was recorded on another robot than the {name} here: {robots}"
+        if robots.another:
+            problems.append(text + ". Put the platform's own robot in place (roborecover doctor)")
+        else:
+            logger.warning("%s; its arms reach the same places, and the check of every handoff decides", text)
+    return problems
+
+
+def _check_versions(scenarios: ScenarioSet, platform: str, assets: Mapping[str, str], strict: bool) -> None:
+    """Compares installed versions with those scores are defined on and those the scenarios were recorded
+    with."""
+    problems = version_problems(platform)
+    recorded: dict[tuple[str, str], str] = {}
+    for scenario in scenarios:
+        if scenario.fingerprint is not None:
+            for item in scenario.fingerprint.versions.items():
+                recorded.setdefault(item, scenario.id)
+    problems += _robot_problems(scenarios, assets)
+    for (name, version), scenario_id in sorted(recorded.items()):
+        if is_robot_entry(name):
+            continue
+        if assets.get(name, version) != version:
+            # A warning: the 2 mm check of every handoff decides whether the difference matters.
+            logger.warning(
+                "scenario %s was recorded with %s %s; here it is %s", scenario_id, name, version, assets[name]
+            )
+        here = installed(name)
+        if here is not None and here != version:
+            problems.append(f"scenario {scenario_id} was recorded with {name} {version}; here it is {here}")
+    if not problems:
+        return
+    if strict:
+        raise OptionError(
+            "versions that decide scores differ: "
+            + "; ".join(problems)
+            + ". Install the versions named, or accept "
+            "scores that compare with nobody else's: --env.strict_versions=false"
+        )
+    for problem in problems:
+        logger.warning("scores will not compare with others': %s", problem)

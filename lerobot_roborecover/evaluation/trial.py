@@ -1,0 +1,403 @@
+"""The life of one trial, from its reset to its row; the one account of it, whoever runs the loop.
+
+    NEW -> HANDING_OFF -> WAITING -> ASKED -> ACTING -> WAITING ... -> OVER
+                                           -> GOING_BACK -> WAITING
+
+1. `begin`: what a simulator needs to rebuild the start. It replays, compares and observes.
+2. `ask`: the policy is asked about the observation. A handoff that was not faithful never comes here: the
+   trial is over before the policy sees anything.
+3. `decide`: the policy's actions, or its wish to go back. A bad action is found here and never sent.
+4. `take`: what the simulator replied. Steps are counted, actions hashed, success is the task's own predicate.
+5. `OVER`, with an outcome: success, out of steps, or why it is invalid. `row` says all of it.
+
+`skip` and `fail` end a trial from wherever it is. Pure: no clock, no process, no file. Two loops drive it:
+`env.vector_env` for LeRobot's, one action at a time, and `trials.engine` for ours, chunk by chunk; the same
+policy gives the same row in both, because a chunk counts as its actions one by one. Where the clock does not
+stop (`real_time`), `decide` puts what was executed while the policy thought before its actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+from typing import Protocol as Interface
+
+import numpy as np
+
+from lerobot_roborecover.evaluation.intervention_record import InterventionRecord
+from lerobot_roborecover.evaluation.real_time import LatencyModel, RealTime
+from lerobot_roborecover.logs.actions import actions_digest
+from lerobot_roborecover.logs.row import (
+    EvalProtocol,
+    RunExtent,
+    TrialRow,
+    make_row,
+    trial_key,
+    trial_seed,
+)
+from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
+from lerobot_roborecover.replay.handoff import Handoff
+from lerobot_roborecover.scenario import Outcome, TrialStart
+from lerobot_roborecover.workers.control_columns import ControlColumns
+from lerobot_roborecover.workers.messages import (
+    ActResult,
+    EpisodeSpec,
+    EpisodeStart,
+    Reply,
+    RollbackReply,
+    SlotFailure,
+    StepResult,
+)
+
+SOLVED_THERE = "the task's predicate already holds where the rollback went"
+FAILURES = {
+    "raised": Outcome.SIM_ERROR,
+    "died": Outcome.SIM_ERROR,
+    "hung": Outcome.TIMEOUT,
+    "lost": Outcome.SIM_ERROR,
+}
+"""What a slot's failure makes of its trial, by kind; one that is `lost` is tried elsewhere first."""
+
+
+class TrialState(StrEnum):
+    """Where a trial is."""
+
+    NEW = "new"
+    """Nothing has been asked of anybody."""
+    HANDING_OFF = "handing_off"
+    """A simulator rebuilds its start."""
+    WAITING = "waiting"
+    """It has an observation that the policy has not been asked about."""
+    ASKED = "asked"
+    """The policy infers."""
+    ACTING = "acting"
+    """A simulator executes actions."""
+    GOING_BACK = "going_back"
+    """A simulator is put back to an earlier state."""
+    OVER = "over"
+    """It has an outcome, or was skipped."""
+
+
+IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK)
+"""States that a simulator's reply ends."""
+
+
+@dataclass(frozen=True)
+class Act:
+    """A decision: execute these."""
+
+    actions: np.ndarray
+    """(n, A), all of them fit to be sent."""
+
+
+@dataclass(frozen=True)
+class RollbackRequest:
+    """A decision: put the simulation back instead of acting."""
+
+    steps: int
+    """How many; `directives.BY_RULE` for the platform's number."""
+
+
+class PolicyStateFactory(Interface):
+    """What keeps a policy's histories (`policies.host`)."""
+
+    def start(self, seed: int | None) -> Any:
+        """Fresh history for a trial of that seed."""
+
+
+class Trial:
+    """One policy on one scenario, once.
+
+    Args:
+        scenario: what is rebuilt.
+        index: k, of the trial within its scenario, from 0.
+        protocol: what the run holds fixed.
+        action_width: A, values in the policy's action.
+        handoff_check: compare the handoff with the scenario's fingerprint.
+        rollback_steps: how far back the policy may ask to go.
+        real_time: what an inference costs; None: the simulator waits.
+    """
+
+    def __init__(
+        self,
+        scenario: TrialStart,
+        index: int,
+        protocol: EvalProtocol,
+        *,
+        action_width: int,
+        handoff_check: bool = True,
+        rollback_steps: int = 0,
+        real_time: RealTime | None = None,
+    ):
+        self.scenario, self.index, self.protocol = scenario, index, protocol
+        self.state = TrialState.NEW
+        self.observation: dict[str, Any] | None = None
+        """The last one there is, unbatched."""
+        self.handoff: Handoff | None = None
+        self.outcome: Outcome | None = None
+        """None until it is over, and where it was skipped."""
+        self.reason = ""
+        self.success = False
+        self.steps = 0
+        """New environment steps; replayed ones do not count. Within S once it is over."""
+        self.attachment = b""
+        """What the simulator's side has made of it once it is over, see `ActResult`."""
+        self._action_width, self._check, self._rollback_steps = action_width, handoff_check, rollback_steps
+        self._sim_s = self._policy_s = 0.0
+        self._executed: list[np.ndarray] = []
+        self._progress: list[int] = []
+        self._record = InterventionRecord()
+        self._real_time = real_time
+        self._clock: LatencyModel | None = None
+        self._sent = np.empty((0, action_width))
+        self._directives: Sequence[ControlColumns] = ()
+
+    @property
+    def key(self) -> tuple:
+        """Its identity in a trial log."""
+        hash_ = self.protocol.config_hash()
+        return trial_key(self.scenario.sha256(), self.scenario.id, hash_, self.index)
+
+    @property
+    def seed(self) -> int | None:
+        """Of its randomness; None where the run has none."""
+        return trial_seed(self.protocol.run_seed, self.scenario.id, self.index)
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more happens in it."""
+        return self.state is TrialState.OVER
+
+    @property
+    def in_simulator(self) -> bool:
+        """Whether a simulator's reply is due."""
+        return self.state in IN_SIMULATOR
+
+    def open_history(self, host: PolicyStateFactory) -> Any:
+        """What the policy side keeps for it: fresh, with its random stream."""
+        return host.start(self.seed)
+
+    # --- its life
+
+    def begin(self, filmed: bool = False) -> EpisodeSpec:
+        """Starts it: what a simulator needs for the handoff.
+
+        Args:
+            filmed: replies are to bring a frame of every step.
+        """
+        self._leave(TrialState.NEW, to=TrialState.HANDING_OFF)
+        return EpisodeSpec(
+            self.scenario,
+            self.protocol.start,
+            self.protocol.rewind_for(self.scenario),
+            self._check,
+            filmed,
+            self._rollback_steps,
+        )
+
+    def ask(self) -> dict[str, Any]:
+        """The observation, for the policy."""
+        self._leave(TrialState.WAITING, to=TrialState.ASKED)
+        assert self.observation is not None
+        return self.observation
+
+    def decide(
+        self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
+    ) -> Act | RollbackRequest | None:
+        """Takes the policy's answer in.
+
+        Args:
+            actions: (n, A), to be executed without looking in between. A bad one ends the trial when it comes
+                up, if it does.
+            directives: one per action, where the policy gives any.
+            seconds: that the policy took, those of a shared batch in full.
+
+        Returns:
+            What the simulator is to do; None where the trial is over instead.
+        """
+        self._leave(TrialState.ASKED, to=TrialState.ACTING)
+        self._policy_s += seconds
+        problem = chunk_problem(self.scenario, actions, self._action_width)
+        if problem:
+            self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {problem}")
+            return None
+        if self._clock is not None:
+            actions = self._clock.sequence(actions, seconds)
+        self._sent, self._directives = actions, directives or ()
+        if self._directives:
+            first = self._directives[0]
+            self._record.note(first, self.steps)
+            if first.rollback:
+                self.state = TrialState.GOING_BACK
+                return RollbackRequest(first.rollback)
+        good = 0
+        while good < len(actions) and not self._problem(actions[good]):
+            good += 1
+        if good:
+            return Act(actions[:good])
+        self._end(Outcome.POLICY_ERROR, self._problem(actions[0]))
+        return None
+
+    def refused(self, why: object, *, seconds: float) -> None:
+        """The policy raised in place of an answer.
+
+        Args:
+            why: its error.
+            seconds: that it took.
+        """
+        self._leave(TrialState.ASKED, to=TrialState.OVER)
+        self._policy_s += seconds
+        self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {why}")
+
+    def take(self, reply: Reply) -> None:
+        """Takes the simulator's reply in."""
+        if isinstance(reply, SlotFailure):
+            self._leave(*IN_SIMULATOR, to=TrialState.OVER)
+            where = f"at step {self.steps}" if self.handoff else "at the handoff"
+            self._end(FAILURES[reply.kind], f"{where}: {reply.message}")
+        elif isinstance(reply, EpisodeStart):
+            self._leave(TrialState.HANDING_OFF, to=TrialState.WAITING)
+            self.observation, self.handoff = reply.observation, reply.handoff
+            if reply.progress is not None:
+                self._progress = [percent(reply.progress)]
+            if self._real_time is not None:
+                self._clock = LatencyModel(self._real_time, reply.hz)
+            if reply.handoff.problem is not None:
+                self._end(reply.handoff.problem, reply.handoff.reason)
+        elif isinstance(reply, RollbackReply):
+            self._leave(TrialState.GOING_BACK, to=TrialState.WAITING)
+            self._record.rolled_back(self._directives[0].rollback, reply)
+            self._sim_s += reply.seconds
+            self.observation = reply.observation
+            if reply.progress is not None:
+                self._progress[-1:] = [percent(reply.progress)]
+            if reply.solved:
+                self._end(Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
+        elif isinstance(reply, StepResult | ActResult):
+            self._leave(TrialState.ACTING, to=TrialState.WAITING)
+            self._acted(reply)
+        else:
+            raise TypeError(f"{self}: a {type(reply).__name__} is no reply to a command of a trial")
+
+    def fail(self, outcome: Outcome, reason: str) -> None:
+        """Ends it wherever it is, for a reason from outside."""
+        self._leave(*(s for s in TrialState if s is not TrialState.OVER), to=TrialState.OVER)
+        self._end(outcome, reason)
+
+    def skip(self, *, success: bool = False, steps: int = 0) -> None:
+        """Ends it before it begins, without a row: an earlier run finished it, or nobody asked for it.
+
+        Args:
+            success: how it ended then.
+            steps: after how many.
+        """
+        self._leave(TrialState.NEW, to=TrialState.OVER)
+        self.success, self.steps = success, steps
+
+    def verdict(self) -> Outcome:
+        """How it ended.
+
+        Raises:
+            RuntimeError: it is not over, or was skipped.
+        """
+        if self.outcome is None:
+            raise RuntimeError(f"{self} has no outcome yet")
+        return self.outcome
+
+    @property
+    def actions(self) -> np.ndarray:
+        """(n, A), what was executed, of the type that the policy gave: replaying it is exact only in that
+        type."""
+        return np.stack(self._executed) if self._executed else np.empty((0, self._action_width), np.float32)
+
+    def row(
+        self,
+        *,
+        dataset: str,
+        dataset_revision: str | None,
+        noise: str,
+        batch_size: int,
+        extent: RunExtent | None = None,
+    ) -> TrialRow:
+        """Its row.
+
+        Args:
+            dataset: where the scenario came from.
+            dataset_revision: and which version of it.
+            noise: how the policy's noise was drawn, see `TrialRow.noise`.
+            batch_size: trials that shared a policy batch, at most.
+            extent: how much its run was to evaluate.
+
+        Raises:
+            RuntimeError: it is not over, or was skipped.
+        """
+        return make_row(
+            self.scenario,
+            self.protocol,
+            dataset=dataset,
+            dataset_revision=dataset_revision,
+            trial=self.index,
+            noise=noise,
+            batch_size=batch_size,
+            outcome=self.verdict(),
+            reason=self.reason,
+            steps=self.steps,
+            handoff=self.handoff,
+            sim_s=self._sim_s,
+            policy_s=self._policy_s,
+            actions_sha256=actions_digest(self._executed),
+            interventions=self._record.entries(),
+            progress=self._progress or None,
+            extent=extent,
+        )
+
+    def __repr__(self) -> str:
+        return f"trial {self.index} of {self.scenario.id} ({self.state})"
+
+    # --- inside
+
+    def _acted(self, reply: StepResult | ActResult) -> None:
+        steps = reply.steps if isinstance(reply, ActResult) else 1
+        self._sim_s += reply.seconds
+        for index, action in enumerate(self._sent[:steps]):
+            self._executed.append(np.array(action))
+            if self._directives:
+                if index:  # the first was noted when it was decided on
+                    self._record.note(self._directives[index], self.steps + index)
+                self._record.acted(self._directives[index])
+        self.steps += steps
+        told = reply.progress if isinstance(reply, ActResult) else (reply.progress,)
+        self._progress += [percent(done) for done in told if done is not None]
+        if reply.observation is not None:
+            self.observation = reply.observation
+        if isinstance(reply, ActResult):
+            self.attachment = reply.attachment
+        if reply.success:
+            self._record.solved()
+        horizon = self.scenario.task.horizon
+        out_of_steps = self.steps >= self._record.budget(horizon)
+        if reply.over if isinstance(reply, ActResult) else reply.success or out_of_steps:
+            outcome, self.steps = self._record.verdict(self.steps, horizon)
+            self._end(outcome)
+        elif steps < len(self._sent):
+            self._end(Outcome.POLICY_ERROR, self._problem(self._sent[steps]))
+
+    def _problem(self, action: np.ndarray) -> str:
+        return action_problem(self.scenario, action, self._action_width)
+
+    def _end(self, outcome: Outcome, reason: str = "") -> None:
+        self.state, self.outcome, self.reason = TrialState.OVER, outcome, reason
+        self.steps = min(self.steps, self.scenario.task.horizon)  # steps that were taken back come on top
+        self.success = outcome is Outcome.SUCCESS
+
+    def _leave(self, *states: TrialState, to: TrialState) -> None:
+        if self.state not in states:
+            raise RuntimeError(f"{self} cannot become {to}: that follows {' or '.join(states)} only")
+        self.state = to
+
+
+def percent(share: float) -> int:
+    """Progress as rows have it: whole per cent, and 100 for nothing less than all."""
+    return 100 if share >= 1.0 else min(max(round(100 * share), 0), 99)

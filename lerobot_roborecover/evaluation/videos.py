@@ -1,0 +1,104 @@
+"""Films of some trials, as many as asked for and no more; a trial nobody wants to see renders nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import av
+import numpy as np
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.work_items import WorkItem
+from lerobot_roborecover.scenario import Outcome
+
+KINDS = ("failures", "successes", "all")
+
+
+class VideoWriter:
+    """An MP4 that grows with its trial, so that no film is ever in memory.
+
+    Args:
+        path: where it is written while the trial runs.
+        fps: frames per second.
+    """
+
+    def __init__(self, path: Path, fps: float):
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._container = av.open(str(path), mode="w", format="mp4")
+        self._stream = self._container.add_stream("libx264", rate=round(fps))
+        self._stream.pix_fmt = "yuv420p"
+        self._size: tuple[int, int] | None = None
+
+    def add(self, frames: Iterable[np.ndarray]) -> None:
+        """Appends (H, W, 3) uint8 frames; an odd row or column is cut off, because yuv420p has none."""
+        for frame in frames:
+            if self._size is None:
+                self._size = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
+                self._stream.height, self._stream.width = self._size
+            picture = np.ascontiguousarray(frame[: self._size[0], : self._size[1]])
+            self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+
+    def keep(self, path: Path) -> None:
+        """Ends the film and gives it its name."""
+        self._container.mux(self._stream.encode())
+        self._container.close()
+        os.replace(self.path, path)
+
+    def drop(self) -> None:
+        """Throws the film away."""
+        self._container.close()
+        self.path.unlink(missing_ok=True)
+
+
+class VideoRecorder:
+    """Decides which trials are filmed and which films stay.
+
+    A trial's outcome is known at its end only, so every trial that might be wanted is filmed until there are
+    enough; at most `count` films and one per slot under way are on disk.
+
+    Args:
+        folder: where films go; those already there count.
+        count: how many to keep.
+        of: `failures`, `successes`, `all`, or comma-separated scenario ids.
+        ids: the run's scenarios.
+
+    Raises:
+        OptionError: `of` names neither.
+    """
+
+    def __init__(self, folder: Path, count: int, of: str, ids: Iterable[str]):
+        self._folder, self._count, self._of = folder, count, of
+        self._ids = None if of in KINDS else {name.strip() for name in of.split(",")}
+        unknown = sorted((self._ids or set()) - set(ids))
+        if unknown:
+            raise OptionError(
+                f"--runner.videos_of={of}: {unknown[0]!r} is neither one of {list(KINDS)} nor a scenario of "
+                "this run"
+            )
+        for part in folder.glob("*.part"):  # of a run that was killed
+            part.unlink()
+        self.kept = sorted(folder.glob("*.mp4"))
+
+    def wants(self, unit: WorkItem) -> bool:
+        """Whether a trial might be kept."""
+        return len(self.kept) < self._count and (self._ids is None or unit.scenario.id in self._ids)
+
+    def begin(self, unit: WorkItem, frame: np.ndarray, fps: float) -> VideoWriter:
+        """A recording that starts with the handoff's frame."""
+        recording = VideoWriter(self._folder / f"{unit.scenario.id}_trial{unit.trial}.part", fps)
+        recording.add([frame])
+        return recording
+
+    def finish(self, recording: VideoWriter, unit: WorkItem, outcome: Outcome) -> None:
+        """Keeps or drops the film of a trial that has ended."""
+        success = outcome is Outcome.SUCCESS
+        fits = self._of not in ("failures", "successes") or success == (self._of == "successes")
+        if not fits or len(self.kept) >= self._count:
+            recording.drop()
+            return
+        path = self._folder / f"{unit.scenario.id}_trial{unit.trial}_{outcome.value}.mp4"
+        recording.keep(path)
+        self.kept.append(path)

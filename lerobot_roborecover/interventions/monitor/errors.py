@@ -1,9 +1,0 @@
-"""What monitors refuse."""
-
-from __future__ import annotations
-
-from lerobot_roborecover.env.options import OptionError
-
-
-class MonitorError(OptionError):
-    """A monitor cannot be built, loaded or asked; the message says what, the value and the remedy."""

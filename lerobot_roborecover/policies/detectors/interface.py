@@ -1,0 +1,222 @@
+"""What is asked of a detector, whatever is inside it: a window of what a trial has shown, in; a score, out.
+
+Contract with whoever implements one:
+
+- A detector is stateless: what it says of a window depends on that window alone. So trials may share a batch,
+  be resumed, and be interleaved in any order; whoever asks keeps the history.
+- It says beforehand what it needs (`DetectorNeeds`): observation keys, how far back it looks, action chunks
+  of the policy that acts, the policy's own features, or a truth that nobody knows while a trial runs.
+- A higher score means "needs help" more. A score of NaN says nothing, and never triggers.
+
+A recovery monitor (`monitor_interface.Monitor`), which judges one observation at a time, is a detector
+through `MonitorDetector`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from lerobot_roborecover.policies.detectors.monitor_interface import Monitor, Verdicts
+
+if TYPE_CHECKING:
+    import torch
+
+TASK = "task"
+"""LeRobot's batch key of the language instructions."""
+CHUNKS = "policy.chunks"
+"""Batch key: (B, T, K, H, A) float32, K action chunks that the policy would begin at each step of the window,
+as it predicts them (normalised)."""
+FEATURES = "policy.features"
+"""Batch key: (B, F) float32, the policy's own features at the last step."""
+STEP = "roborecover.watched_step"
+"""Batch key: (B,) int64, environment steps since the watch began."""
+SEEN = "roborecover.seen"
+"""Batch key: (B,) int64, steps of the window that have been; those before them repeat the first."""
+SEED = "roborecover.seed"
+"""Batch key: (B,) int64, the trial's."""
+DEVIATED = "roborecover.deviated"
+"""Batch key: (B,) float32, 1 from the recovery point on; NaN where nobody knows."""
+WILL_FAIL = "roborecover.helpless"
+"""Batch key: (B,) float32, 1 where the policy does not recover by itself; NaN where nobody knows."""
+
+
+@dataclass(frozen=True)
+class DetectorNeeds:
+    """What must be there for a detector to say anything."""
+
+    features: Mapping[str, Any] = field(default_factory=dict)
+    """Observations, by LeRobot key, as `PolicyFeature`s."""
+    past: int = 0
+    """Steps before now that it looks back at."""
+    chunks: int = 0
+    """Action chunks of the acting policy, sampled at every step of the window."""
+    internals: bool = False
+    """The acting policy's own features."""
+    truth: str = ""
+    """`recovery_point` or `outcome`: known only to who evaluates."""
+
+    @property
+    def of_policy(self) -> bool:
+        """Whether the acting policy is asked for something beside its actions."""
+        return bool(self.chunks) or self.internals
+
+
+@dataclass(frozen=True)
+class StepObservation:
+    """What one step of a trial shows."""
+
+    observation: Mapping[str, torch.Tensor]
+    """As it leaves the env preprocessor, without a batch axis: pictures (3, H, W) float32 in [0, 1]."""
+    chunks: torch.Tensor | None = None
+    """(K, H, A) float32."""
+    features: torch.Tensor | None = None
+    """(F,) float32."""
+
+
+@dataclass(frozen=True)
+class DetectorWindow:
+    """What a detector is asked about."""
+
+    glimpses: Sequence[StepObservation]
+    """From the oldest to now; as many as the detector looks back at and one, fewer where the watch has just
+    begun."""
+    instruction: str
+    step: int
+    """Environment steps since the watch began."""
+    seed: int = 0
+    """The trial's."""
+    deviated: float = math.nan
+    """1 from the recovery point on, 0 before it; NaN where nobody knows."""
+    helpless: float = math.nan
+    """1 where the policy does not recover by itself, 0 where it does; NaN where nobody knows."""
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Says of each window how much help is needed."""
+
+    @property
+    def needs(self) -> DetectorNeeds:
+        """What must be there."""
+
+    @property
+    def max_batch(self) -> int:
+        """Windows that it can judge at once."""
+
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
+        """Scores, and whether each asks for help at the detector's own threshold; never where it has none."""
+
+
+class MonitorDetector:
+    """A monitor as a detector: it looks at the last observation alone.
+
+    Args:
+        monitor: of `monitor_loading.load_monitor`.
+    """
+
+    def __init__(self, monitor: Monitor):
+        self.monitor = monitor
+
+    @property
+    def needs(self) -> DetectorNeeds:
+        """What it was trained on."""
+        return DetectorNeeds(features=self.monitor.input_features)
+
+    @property
+    def max_batch(self) -> int:
+        """The monitor's."""
+        return self.monitor.max_batch
+
+    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
+        """The monitor's own answers."""
+        import torch
+
+        keys = windows[0].glimpses[-1].observation
+        seen = {k: torch.stack([w.glimpses[-1].observation[k] for w in windows]) for k in keys}
+        return self.monitor.judge(seen, [w.instruction for w in windows])
+
+
+def as_detector(judge: Detector | Monitor) -> Detector:
+    """A detector, or a monitor as one."""
+    return judge if isinstance(judge, Detector) else MonitorDetector(judge)
+
+
+class DetectorHistory:
+    """What one trial has shown to one detector.
+
+    Args:
+        past: steps before now that are kept.
+        seed: the trial's.
+    """
+
+    def __init__(self, past: int, seed: int | None):
+        self._glimpses: deque[StepObservation] = deque(maxlen=past + 1)
+        self._step, self._seed, self._instruction = -1, seed or 0, ""
+
+    def show(self, glimpse: StepObservation, instruction: str) -> DetectorWindow:
+        """The window that ends with this step."""
+        self._glimpses.append(glimpse)
+        self._step += 1
+        self._instruction = instruction
+        return self._window()
+
+    def amend(self, chunks: torch.Tensor | None, features: torch.Tensor | None) -> DetectorWindow:
+        """The same window, its last step with what the policy would do and computes there."""
+        self._glimpses[-1] = StepObservation(self._glimpses[-1].observation, chunks, features)
+        return self._window()
+
+    def _window(self) -> DetectorWindow:
+        return DetectorWindow(tuple(self._glimpses), self._instruction, self._step, self._seed)
+
+
+def batch_of(windows: Sequence[DetectorWindow], needs: DetectorNeeds) -> dict[str, Any]:
+    """Windows as a batch of LeRobot's reward models.
+
+    Returns:
+        Observations by key, (B, ...) where the detector looks at now alone, else (B, past + 1, ...), oldest
+        first, the first repeated where the watch has just begun (as LeRobot's datasets do); `task`; and the
+        keys of this module, those that are needed.
+    """
+    import torch
+
+    batch: dict[str, Any] = {
+        TASK: [w.instruction for w in windows],
+        STEP: torch.tensor([w.step for w in windows]),
+        SEEN: torch.tensor([len(w.glimpses) for w in windows]),
+        SEED: torch.tensor([w.seed for w in windows]),
+        DEVIATED: torch.tensor([w.deviated for w in windows], dtype=torch.float32),
+        WILL_FAIL: torch.tensor([w.helpless for w in windows], dtype=torch.float32),
+    }
+    rows = [_padded(w.glimpses, needs.past) for w in windows]
+    for key in needs.features:
+        if needs.past:
+            batch[key] = torch.stack([torch.stack([g.observation[key] for g in row]) for row in rows])
+        else:
+            batch[key] = torch.stack([row[-1].observation[key] for row in rows])
+    if needs.chunks:
+        batch[CHUNKS] = torch.stack([torch.stack([_given(g.chunks) for g in row]) for row in rows])
+    if needs.internals:
+        batch[FEATURES] = torch.stack([_given(row[-1].features) for row in rows])
+    return batch
+
+
+def _padded(glimpses: Sequence[StepObservation], past: int) -> list[StepObservation]:
+    row = list(glimpses[-(past + 1) :])
+    return [row[0]] * (past + 1 - len(row)) + row
+
+
+def _given(part: torch.Tensor | None) -> torch.Tensor:
+    if part is None:
+        raise ValueError("the detector was not given what it needs of the policy")
+    return part
+
+
+def scores_of(verdicts: Verdicts) -> np.ndarray:
+    """(B,) float64 scores of verdicts."""
+    return np.asarray(verdicts.scores, dtype=np.float64)

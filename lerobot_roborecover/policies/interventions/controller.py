@@ -1,0 +1,265 @@
+"""Decides, slot by slot and step by step, who acts: the one implementation under both runners.
+
+For each slot that wants an action:
+
+1. where an intervention is still to come, the monitor judges the observation (or, without one, it comes at
+   once); at most one intervention a trial;
+2. `reversion` asks the environment to go back, and the base policy goes on from there with fresh history;
+   `correction` and `human` take over with fresh history, for some steps or until the driver is done;
+3. whoever is in charge is asked for a chunk where the slot's queue is empty, all slots of one policy in one
+   batch;
+4. while a monitor is to see every step, one action leaves the queue at a time; otherwise all of them.
+
+Nothing that happens in one slot touches another's queue, history or random stream.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorHistory, as_detector
+from lerobot_roborecover.policies.detectors.monitor_interface import Monitor
+from lerobot_roborecover.policies.detectors.online import OnlineDetector
+from lerobot_roborecover.policies.detectors.probe import PolicyProbe
+from lerobot_roborecover.policies.interventions.members import MemberHost
+from lerobot_roborecover.policies.interventions.takeover import Driver
+from lerobot_roborecover.policies.runner import Chunk, PolicyError
+from lerobot_roborecover.workers.control_columns import BY_RULE, ControlColumns, Controller, attach
+
+type Observation = Mapping[str, torch.Tensor]
+"""After the env preprocessor, batch axis of 1."""
+
+
+@dataclass(eq=False)
+class InterventionState:
+    """One trial, as the composite policy sees it."""
+
+    seed: int | None
+    pending: bool
+    """An intervention may still come."""
+    controller: Controller = Controller.BASE
+    history: Any = None
+    """The acting policy's, or what the driver calls the slot."""
+    stream: list[torch.Tensor] | None = None
+    """The trial's random stream, while no policy has it."""
+    queue: np.ndarray | None = None
+    """(n, A) actions still to be executed."""
+    left: int = 0
+    """Steps that the correction policy still has."""
+    first: ControlColumns = field(default_factory=ControlColumns)
+    """What is to stand beside the next action."""
+    watch: DetectorHistory | None = None
+    """What the monitor has seen of it; None without one."""
+
+
+class InterventionController:
+    """Members, and what is to happen when.
+
+    Args:
+        members: the policies, by who they act as; `Controller.BASE` is among them.
+        mode: of the composite policy.
+        monitor: a monitor or any other detector, which decides when; None intervenes at the recovery point.
+        probe: into the base policy, for a detector that looks into it.
+        driver: the person, for mode `human`.
+        correction_steps: of the correction policy.
+        rewind_steps: of a rollback; None follows the paper's rule.
+    """
+
+    def __init__(
+        self,
+        members: Mapping[Controller, MemberHost],
+        mode: str,
+        *,
+        monitor: Monitor | Detector | None = None,
+        probe: PolicyProbe | None = None,
+        driver: Driver | None = None,
+        correction_steps: int = 30,
+        rewind_steps: int | None = None,
+    ):
+        self.members = dict(members)
+        self._mode, self._driver = mode, driver
+        self._watcher = None if monitor is None else OnlineDetector(as_detector(monitor), probe)
+        self._correction_steps = correction_steps
+        self._rollback = BY_RULE if rewind_steps is None else rewind_steps
+        self._width = self.members[Controller.BASE].action_width
+
+    def start(self, seed: int | None) -> InterventionState:
+        """A trial, with the base policy in charge.
+
+        Args:
+            seed: the trial's; None where the run has none, or where torch's own generator is seeded for it.
+        """
+        episode = InterventionState(seed, pending=self._mode != "direct")
+        episode.watch = self._watcher.start(seed) if self._watcher else None
+        episode.history = self.members[Controller.BASE].start(seed)
+        return episode
+
+    def finish(self, episode: InterventionState) -> None:
+        """Gives back what a trial held."""
+        self._leave(episode)
+
+    def act(
+        self,
+        observations: Sequence[Observation],
+        instructions: Sequence[str],
+        episodes: Sequence[InterventionState],
+    ) -> list[Chunk | PolicyError]:
+        """Actions with directives for slots that have none left to execute.
+
+        Args:
+            observations: of each slot.
+            instructions: of their tasks.
+            episodes: their trials, updated here.
+
+        Returns:
+            Arrays (n, A + 5), see `env.directives`; an error in place of each for which a member raised.
+        """
+        out: list[Chunk | PolicyError | None] = [None] * len(episodes)
+        self._watch(observations, instructions, episodes, out)
+        # A driver that hands its slot back is followed by the base policy in the same step.
+        for controller in (Controller.HUMAN, Controller.CORRECTION, Controller.BASE):
+            due = [
+                i
+                for i, e in enumerate(episodes)
+                if out[i] is None and e.queue is None and e.controller is controller
+            ]
+            if not due:
+                continue
+            if controller is Controller.HUMAN:
+                chunks = [self._driven(observations[i], instructions[i], episodes[i]) for i in due]
+            else:
+                chunks = self.members[controller].act(
+                    [observations[i] for i in due],
+                    [instructions[i] for i in due],
+                    [episodes[i].history for i in due],
+                )
+            for i, chunk in zip(due, chunks, strict=True):
+                if isinstance(chunk, PolicyError):
+                    out[i] = PolicyError(f"{controller.name.lower()}: {chunk}")
+                else:
+                    episodes[i].queue = chunk
+        return [self._next(e) if o is None else o for e, o in zip(episodes, out, strict=True)]
+
+    # --- when
+
+    def _watch(
+        self,
+        observations: Sequence[Observation],
+        instructions: Sequence[str],
+        episodes: Sequence[InterventionState],
+        out: list[Chunk | PolicyError | None],
+    ) -> None:
+        pending = [i for i, e in enumerate(episodes) if e.pending]
+        fires = dict.fromkeys(pending, True)
+        if self._watcher is not None and pending:
+            size = self._watcher.max_batch
+            for at in range(0, len(pending), size):
+                part = pending[at : at + size]
+                began = time.perf_counter()
+                try:
+                    verdicts = self._watcher.judge(
+                        [w for i in part if (w := episodes[i].watch) is not None],
+                        [{k: v[0] for k, v in observations[i].items()} for i in part],
+                        [instructions[i] for i in part],
+                    )
+                except Exception as err:  # as with policies: whatever a monitor raises costs its trials alone
+                    for i in part:
+                        out[i] = PolicyError(f"monitor: {type(err).__name__}: {err}")
+                        fires[i] = False
+                    continue
+                seconds = (time.perf_counter() - began) / len(part)
+                for i, score, trigger in zip(part, verdicts.scores, verdicts.triggers, strict=True):
+                    fires[i] = bool(trigger) and not np.isnan(score)
+                    episodes[i].first = ControlColumns(
+                        controller=episodes[i].controller, asked=True, score=float(score), monitor_s=seconds
+                    )
+        for i in pending:
+            if fires[i]:
+                out[i] = self._intervene(episodes[i], instructions[i])
+
+    def _intervene(self, episode: InterventionState, instruction: str) -> Chunk | None:
+        """Hands the slot over; the rollback itself, where that is what it takes."""
+        episode.pending = False
+        told = episode.first
+        if self._mode.endswith("reversion"):
+            self._hand_over(episode, Controller.BASE)
+            episode.first = ControlColumns()
+            step_back = ControlColumns(
+                self._rollback, Controller.BASE, told.asked, told.score, told.monitor_s
+            )
+            return attach(np.zeros((1, self._width), np.float32), step_back)
+        taker = Controller.HUMAN if self._mode == "human" else Controller.CORRECTION
+        self._hand_over(episode, taker)
+        if taker is Controller.HUMAN:
+            episode.history = self._person().take(instruction)
+        else:
+            episode.left = self._correction_steps
+        episode.first = ControlColumns(0, taker, told.asked, told.score, told.monitor_s)
+        return None
+
+    # --- who
+
+    def _leave(self, episode: InterventionState) -> None:
+        if episode.history is None:
+            return
+        if episode.controller is Controller.HUMAN:
+            self._person().leave(episode.history)
+        else:
+            episode.stream = episode.history.stream
+            self.members[episode.controller].finish(episode.history)
+        episode.history = None
+
+    def _hand_over(self, episode: InterventionState, controller: Controller) -> None:
+        """Fresh history and an empty queue for whoever takes over; the trial's random stream goes on."""
+        self._leave(episode)
+        episode.controller, episode.queue = controller, None
+        if controller in self.members:
+            episode.history = self.members[controller].start(None)
+            episode.history.stream = episode.stream
+
+    def _person(self) -> Driver:
+        if self._driver is None:
+            raise RuntimeError(f"mode {self._mode} needs a driver")
+        return self._driver
+
+    def _driven(
+        self, observation: Observation, instruction: str, episode: InterventionState
+    ) -> Chunk | PolicyError | None:
+        """The person's next action; None where they have handed the slot back."""
+        alone = {k: v[0] if isinstance(v, torch.Tensor) else v for k, v in observation.items()}
+        action = self._person().act(episode.history, alone)
+        if action is None:
+            # The queue stays empty: the base policy is asked in the same step.
+            self._hand_over(episode, Controller.BASE)
+            told = episode.first
+            episode.first = ControlColumns(0, Controller.BASE, told.asked, told.score, told.monitor_s)
+            return None
+        action = np.asarray(action)
+        if action.shape != (self._width,) or not np.issubdtype(action.dtype, np.floating):
+            return PolicyError(f"the driver gave {action.dtype} {action.shape}, not floats ({self._width},)")
+        return action[None]
+
+    def _next(self, episode: InterventionState) -> Chunk:
+        """What is executed before the slot is asked about again."""
+        queue = episode.queue
+        assert queue is not None
+        take = len(queue)
+        if episode.controller is Controller.CORRECTION:
+            take = min(take, episode.left)
+        if episode.pending and self._watcher is not None:
+            take = 1
+        rows = attach(np.ascontiguousarray(queue[:take]), episode.first)
+        episode.queue = queue[take:] if take < len(queue) else None
+        episode.first = ControlColumns(controller=episode.controller)
+        if episode.controller is Controller.CORRECTION:
+            episode.left -= take
+            if not episode.left:
+                self._hand_over(episode, Controller.BASE)
+                episode.first = ControlColumns()
+        return rows

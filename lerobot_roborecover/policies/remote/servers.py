@@ -1,0 +1,62 @@
+"""Which protocol a policy server is spoken to in."""
+
+from __future__ import annotations
+
+from lerobot_roborecover.policies.remote.configuration_remote import SCHEMES, RemoteConfig
+from lerobot_roborecover.policies.remote.connection import RemoteServer, ServerOptions
+from lerobot_roborecover.policies.remote.errors import MappingError, RemoteError
+from lerobot_roborecover.policies.remote.keys import api_key
+from lerobot_roborecover.policies.remote.mapping import Mapping
+from lerobot_roborecover.policies.remote.vla_eval import EpisodeServer
+
+
+def make_server(config: RemoteConfig, mapping: Mapping) -> RemoteServer:
+    """A server, not connected to yet.
+
+    Args:
+        config: address, times and limits.
+        mapping: whose protocol is spoken.
+
+    Raises:
+        MappingError: the mapping is for another protocol, or another kind of address.
+        RemoteError: an extra is not installed, or the key cannot be used.
+    """
+    if config.protocol not in ("", mapping.protocol):
+        raise MappingError(
+            f"--policy.mapping={config.mapping} is for {mapping.protocol}; --policy.protocol="
+            f"{config.protocol} needs one of its own"
+        )
+    schemes = SCHEMES[mapping.protocol]
+    if not config.url.startswith(schemes):
+        raise MappingError(
+            f"--policy.mapping={config.mapping} is for {mapping.protocol}; --policy.url={config.url} is "
+            f"not: write {schemes[0]}HOST:PORT"
+        )
+    greetings = {"openpi": mapping.reset.message if mapping.reset else None, "vla_eval": mapping.episode}
+    return _server_class(mapping.protocol)(
+        ServerOptions(
+            config.url,
+            timeout_s=config.timeout_s,
+            wait_s=config.wait_s,
+            reconnect_s=config.reconnect_s,
+            connections=config.connections,
+            max_frame_bytes=config.max_frame_mb * 2**20,
+            api_key=api_key(),
+            greeting=greetings.get(mapping.protocol),
+        )
+    )
+
+
+def _server_class(protocol: str) -> type[RemoteServer]:
+    if protocol == "vla_eval":
+        return EpisodeServer
+    if protocol == "gr00t":
+        try:
+            from lerobot_roborecover.policies.remote.gr00t import CallServer
+        except ModuleNotFoundError as err:
+            raise RemoteError(
+                f"--policy.protocol=gr00t needs {err.name}: install the extra gr00t "
+                "(uv pip install -e '.[gr00t]' in a clone)"
+            ) from err
+        return CallServer
+    return RemoteServer

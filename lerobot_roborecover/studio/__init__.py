@@ -1,1 +1,0 @@
-"""The web pages on which people annotate and drive, and what serves them on this machine alone."""

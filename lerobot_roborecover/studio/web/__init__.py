@@ -1,1 +1,0 @@
-"""What the pages of `annotate` and `teleop` share: who may ask, and a server on this machine alone."""

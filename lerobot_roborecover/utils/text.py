@@ -1,0 +1,56 @@
+"""How numbers of things and commands are written in what people read."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+
+# tqdm's, with and without a total; other output may begin right behind one.
+_PROGRESS_BAR = re.compile(r"[^\r\n]*?(?:\d+%\|[^\r\n]*?|\b\d+it )\[[^\]\r\n]*\]")
+_ERROR = re.compile(r"(?:\w+\.)*\w*(?:Error|Exception|Interrupt)\b(?!\s+ignored)")
+_PLURALS = {"policy": "policies", "trajectory": "trajectories", "history": "histories"}
+
+
+def pluralize(number: int, thing: str) -> str:
+    """A number of things: `1 candidate`, `2 candidates`.
+
+    Args:
+        number: how many.
+        thing: one of them; of several words the last is put into the plural.
+    """
+    if number == 1:
+        return f"{number} {thing}"
+    *before, last = thing.split(" ")
+    return " ".join([str(number), *before, _PLURALS.get(last, f"{last}s")])
+
+
+def next_command(argv: Sequence[str], what: str = "next") -> str:
+    """The line that names the command to run after this one, as a shell takes it.
+
+    Args:
+        argv: after `roborecover`; words in capitals are for whoever runs it to fill in.
+        what: the line's beginning.
+    """
+    return f"{what}: roborecover {shlex.join(argv)}"
+
+
+def format_duration(seconds: float) -> str:
+    """A duration as `h:mm:ss`."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def output_end(output: str, most_lines: int) -> tuple[str, str]:
+    """Returns why a program failed, and the end of its output, without progress bars.
+
+    Args:
+        output: what it printed.
+        most_lines: of the end.
+
+    Returns:
+        The last line that names an error, else the last line, else nothing; and the last lines, indented.
+    """
+    lines = [line.rstrip() for line in re.split(r"[\r\n]", _PROGRESS_BAR.sub("", output)) if line.strip()]
+    causes = [line.strip() for line in lines if _ERROR.match(line.strip())] or lines[-1:]
+    return (causes[-1] if causes else ""), "\n".join(f"  {line}" for line in lines[-most_lines:])

@@ -1,0 +1,159 @@
+"""Runs teleoperation: the simulator's thread, the page's server, and at the end the candidate dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.curation.annotation.votes import check_name
+from lerobot_roborecover.platforms import make_simulator, platform_named
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
+from lerobot_roborecover.web.teleop.hub import Hub
+from lerobot_roborecover.web.teleop.simulator_thread import SimulatorThread
+from lerobot_roborecover.web.teleop.spacemouse import SpaceMouse
+from lerobot_roborecover.web.teleop.starts import StartPoint
+from lerobot_roborecover.web.teleop.store import Store, read_recording
+from lerobot_roborecover.web.teleop.write import check_open, recordings_folder, write_dataset
+
+DEFAULT_PORT = 8732
+
+
+@dataclass(frozen=True)
+class TeleopConfig:
+    """One operator's session."""
+
+    dataset: Path
+    """The candidate dataset; new, or one that an earlier session made."""
+    platform: str
+    operator: str
+    """A plain name or pseudonym; becomes the recordings' driver."""
+    starts: Sequence[StartPoint] = ()
+    port: int = DEFAULT_PORT
+    """0 takes a free one."""
+    rate_hz: float | None = None
+    """Control steps a second, at most; None for the simulator's own."""
+    fps: float = 15.0
+    """Live pictures a second, at most."""
+    view_size: int = 320
+    """Rows and columns of the live pictures."""
+    size: int | None = None
+    """Rows and columns of the dataset's pictures; None for the platform's own, 0 for none: numbers alone."""
+    film_every: int = 1
+    """Steps from one of the dataset's pictures to the next, where rendering is slow."""
+    spacemouse: float | None = None
+    """What the end of a SpaceMouse's range gives, up to 1; None reads none."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the simulator, beside its pictures."""
+
+
+def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
+    """Serves until interrupted, then writes what was saved into the dataset.
+
+    Args:
+        config: the session.
+        say: told the address and what happens, one line each.
+
+    Raises:
+        ScenarioError: something cannot be read or written, or the port is taken.
+        SimulatorError: the simulator cannot be had.
+    """
+    try:
+        import uvicorn  # noqa: F401 - what is missing is said before a simulator starts
+        import websockets  # noqa: F401 - uvicorn speaks websockets with it
+
+        from lerobot_roborecover.web.teleop.server import NAME, TeleopApp, make_app
+    except ImportError as err:
+        raise ScenarioError(
+            f"teleoperation needs {err.name}: pip install 'lerobot_env_roborecover[teleop]'"
+        ) from None
+    platform_named(config.platform).controls()
+    check_open(config.dataset)
+    operator = check_operator(config.operator)
+    store = Store(recordings_folder(config.dataset))
+    try:
+        _check_platform(store, config.platform)
+        listener = listen(config.port)
+        try:
+            port = listener.getsockname()[1]
+            hub = Hub()
+            options = {**config.options, **view_options(config.platform, config.view_size)}
+            options |= platform_named(config.platform).controls().live_options
+            simulation = SimulatorThread(
+                lambda: make_simulator(config.platform, **options),
+                operator, config.starts, store, hub, config.rate_hz, config.fps,
+            )  # fmt: skip
+            simulation.start()
+            simulation.ready.wait()
+            if simulation.error is not None:
+                raise simulation.error
+            mouse = None
+            if config.spacemouse is not None:
+                mouse = SpaceMouse(simulation.pilot, config.spacemouse)
+                mouse.start()
+            token = kept_tokens("teleop", config.dataset, [operator])[operator]
+            try:  # from the first line on: who reads the address may interrupt at once
+                say(f"{operator}: {len(config.starts)} starts  http://{HOST}:{port}/{NAME}/?token={token}")
+                say(f"recordings are kept in {store.folder}; Ctrl-C stops and writes {config.dataset}")
+                make_server(make_app(TeleopApp(token, own_hosts(port), hub, simulation.pilot))).run(
+                    sockets=[listener]
+                )
+            except KeyboardInterrupt:
+                say("stopped; writing the dataset. Ctrl-C leaves that for `roborecover teleop --write`")
+            finally:
+                if mouse is not None:
+                    mouse.stop()
+                simulation.stop()
+                simulation.join()
+        finally:
+            listener.close()
+        write_dataset(
+            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+        )
+    finally:
+        store.close()
+
+
+def write(config: TeleopConfig, say: Callable[[str], None]) -> None:
+    """Writes what earlier sessions saved into the dataset, and serves nothing.
+
+    Raises:
+        ScenarioError: there is nothing, or it cannot be written.
+    """
+    store = Store(recordings_folder(config.dataset))
+    try:
+        _check_platform(store, config.platform)
+        write_dataset(
+            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+        )
+    finally:
+        store.close()
+
+
+def view_options(platform: str, size: int | None) -> dict[str, Any]:
+    """A simulator's options for square pictures of a size; its own where that is None."""
+    return (
+        {"obs_type": "pixels_agent_pos"} if size is None else platform_named(platform).picture_options(size)
+    )
+
+
+def check_operator(name: str) -> str:
+    """An operator's name, as it goes into ids.
+
+    Raises:
+        ScenarioError: it is not plain.
+    """
+    try:
+        return check_name(name)
+    except ScenarioError as err:
+        raise ScenarioError(str(err).replace("annotator", "operator", 1)) from None
+
+
+def _check_platform(store: Store, platform: str) -> None:
+    paths = store.paths()
+    if paths and (found := read_recording(paths[0]).task.platform) != platform:
+        raise ScenarioError(
+            f"{store.folder} holds recordings of {found}, not {platform}; name another dataset"
+        )

@@ -1,0 +1,35 @@
+"""What is shown of the output of a program that failed."""
+
+from __future__ import annotations
+
+import pytest
+
+from lerobot_roborecover.utils.text import output_end
+
+BAR = "Stepping through eval batches:  {n:2}%|##   | {n}/100 [00:01<00:09,  9.9it/s]"
+BARS = "\r".join(BAR.format(n=n) for n in range(60))
+
+
+@pytest.mark.parametrize(
+    ("output", "cause", "shown"),
+    [
+        (
+            f"{BARS}\nTraceback:\n  x = 1\npkg.LogError: in use\n{BARS}", "pkg.LogError: in use",
+            ["Traceback:", "  x = 1", "pkg.LogError: in use"],
+        ),
+        (
+            f"{BARS}ValueError: 3 [of 4]\nbye\n12it [00:01, 3.2it/s]", "ValueError: 3 [of 4]",
+            ["ValueError: 3 [of 4]", "bye"],
+        ),
+        ("a: no such option\n", "a: no such option", ["a: no such option"]),
+        ("Error: one\nKeyError: 'two'\n", "KeyError: 'two'", ["Error: one", "KeyError: 'two'"]),
+        (BARS, "", []),
+        ("", "", []),
+    ],
+)  # fmt: skip
+def test_the_end_of_an_output_is_its_cause_and_no_progress_bars(output, cause, shown):
+    assert output_end(output, 9) == (cause, "\n".join(f"  {line}" for line in shown))
+
+
+def test_only_so_many_lines_are_shown():
+    assert output_end("OSError: full\n1\n2\n3\n", 2) == ("OSError: full", "  2\n  3")

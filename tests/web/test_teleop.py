@@ -1,0 +1,531 @@
+"""Teleoperation below the page: what is recorded is what happened, and nothing sent breaks the server."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.curation.film import Film, read_film
+from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.web.serve import MAX_SOCKET_MESSAGE_BYTES, listen, make_server
+from lerobot_roborecover.web.teleop.client import Client, TeleopRefusal
+from lerobot_roborecover.web.teleop.hub import Hub
+from lerobot_roborecover.web.teleop.pilot import most_unseen
+from lerobot_roborecover.web.teleop.serve import view_options
+from lerobot_roborecover.web.teleop.server import TeleopApp, make_app
+from lerobot_roborecover.web.teleop.session import TeleopSession
+from lerobot_roborecover.web.teleop.simulator_thread import SimulatorThread
+from lerobot_roborecover.web.teleop.starts import continued, first_state
+from lerobot_roborecover.web.teleop.store import Store, lacking, read_recording
+from lerobot_roborecover.web.teleop.write import (
+    _as_candidate,
+    check_open,
+    recordings_folder,
+    write_dataset,
+)
+from tests.support.candidate_files import candidate_dataset
+from tests.support.processes import PATIENCE_S
+from tests.support.teleop_sessions import push
+
+TOKEN = "t" * 32
+
+
+@contextmanager
+def cockpit(folder, starts=(), platform="fake"):
+    """Server and simulator in threads of this process; yields the page's address."""
+    store, hub = Store(folder), Hub()
+    simulation = SimulatorThread(lambda: make_simulator(platform), "ann", starts, store, hub)
+    simulation.start()
+    simulation.ready.wait()
+    listener = listen(0)
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    server = make_server(make_app(TeleopApp(TOKEN, frozenset({host}), hub, simulation.pilot)))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield f"http://{host}/drive/?token={TOKEN}"
+    finally:
+        server.should_exit = True
+        thread.join()
+        simulation.stop()
+        simulation.join()
+        store.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    with cockpit(tmp_path_factory.mktemp("r") / "set.recordings") as found:
+        yield found
+
+
+# --- what is recorded
+
+
+def states(simulator, start, actions) -> list[str]:
+    simulator.reset(start.task, start.reset)
+    found = [simulator.state_sha256()]
+    for action in actions:
+        simulator.step(action)
+        found.append(simulator.state_sha256())
+    return found
+
+
+def check_exact(platform, task, moves, width, **options) -> None:
+    """Drives and takes back at random; what is left must be what its actions alone give."""
+    simulator, start = make_simulator(platform, **options), first_state(platform, task, seed=5)
+    session = TeleopSession(simulator, "ann")
+    session.start(start)
+    rng = np.random.default_rng(len(moves))
+    for move in moves:
+        if move > 0:
+            for _ in range(move):
+                session.act(rng.uniform(-1, 1, width), "script")
+        else:
+            session.back(-move)
+    assert len(session.bodies) == len(session.solved) == session.step + 1
+    assert states(make_simulator(platform, **options), start, session.actions)[-1] == simulator.state_sha256()
+    assert session.bodies[-1] == simulator.bodies()
+    if session.step:
+        session.back(1)
+        session.act(last := rng.uniform(-1, 1, width), "script")
+        again = states(make_simulator(platform, **options), start, [*session.actions[:-1], last])
+        assert again[-1] == simulator.state_sha256()
+    simulator.close()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(-30, 30).filter(bool), max_size=8))
+def test_steps_taken_back_never_happened(moves):
+    check_exact("fake", "push-left", moves, 2)
+
+
+@pytest.mark.metaworld
+def test_steps_taken_back_never_happened_on_metaworld():
+    check_exact("metaworld", "push-v3", [25, -10, 230, -3, 5, -210, 4], 4, obs_type="state")
+
+
+def test_a_mark_needs_a_deviation_and_goes_with_the_steps_before_it(address):
+    with Client(address) as client:
+        client.start("push-left", seed=3)
+        with pytest.raises(TeleopRefusal, match="nothing has happened yet"):
+            client.mark()
+        client.act(np.full((12, 2), 0.1))
+        with pytest.raises(TeleopRefusal, match="must be empty or one of Approach"):
+            client.mark("Grasp")
+        assert client.mark("Contact", "Wrong Pose")["mark"] == [12, "Contact", "Wrong Pose"]
+        client.act([0.1, 0.1])
+        assert client.back(1)["mark"] == [12, "Contact", "Wrong Pose"]
+        assert client.back(1)["mark"] is None
+        assert client.back(500)["step"] == 0
+        with pytest.raises(TeleopRefusal, match="nothing was driven"):
+            client.finish(as_dropped=True)
+        client.act([0.1, 0.1])
+        with pytest.raises(TeleopRefusal, match="a recording is under way"):
+            client.start("push-left")
+        with pytest.raises(TeleopRefusal, match="no recovery point marked"):
+            client.finish()
+        push(client)
+        with pytest.raises(TeleopRefusal, match="nothing to recover from"):
+            client.mark()
+        client.discard()
+        with pytest.raises(TeleopRefusal, match="start a task first"):
+            client.act([0, 0])
+        with pytest.raises(TeleopRefusal, match="fake has no task"):
+            client.start("../push")
+
+
+def test_a_script_records_what_it_sent_bit_for_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    sent = rng.uniform(-1, 1, (9, 2))
+    with cockpit(tmp_path / "set.recordings") as found, Client(found) as client:
+        client.start("push-left", seed=4)
+        client.act(sent[0])
+        client.act(sent[1:])
+        client.mark()
+        push(client)
+        name = client.finish()
+    (path,) = (tmp_path / "set.recordings").glob("recording-*.npz")
+    saved = read_recording(path)
+    assert (saved.id, saved.operator, saved.mark) == (name, "ann", (9, "", ""))
+    assert saved.actions[:9].tobytes() == sent.tobytes()
+    assert saved.lacks == ""
+    assert saved.solved[-1]
+    assert saved.notes["recovery_steps"] == len(saved.actions) - 9
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ScenarioError, match="not a whole recording"):
+        read_recording(path)
+
+
+def test_one_process_holds_a_datasets_recordings(tmp_path):
+    first = Store(tmp_path / "r")
+    with pytest.raises(ScenarioError, match="in use by another"):
+        Store(tmp_path / "r")
+    first.close()
+    Store(tmp_path / "r").close()
+
+
+def test_a_rollout_is_continued_from_any_of_its_steps(tmp_path):
+    dataset = candidate_dataset(tmp_path / "natural", 2)
+    start = continued(dataset, "ep-0001", 20)
+    session = TeleopSession(make_simulator("fake"), "ann")
+    session.start(start)
+    assert session.step == 20
+    recorded = read_candidates(dataset).steps(1).bodies["puck"][20, :3]
+    assert session.bodies[-1]["puck"].position_m == tuple(recorded)
+    session.act(np.array([1.0, 0.0]), "script")
+    assert session.back(50) == 1, "what came before was not driven here"
+    session.act(np.array([1.0, 0.0]), "script")
+    saved = session.recorded("x", as_dropped=True)
+    assert saved.source_record == "ep-0001"
+    assert saved.notes["continues"] == {
+        "dataset": "natural", "candidate": "ep-0001", "step": 20, "driver": "noise",
+    }  # fmt: skip
+    for name, step, message in (("ep-9", 20, "no candidate"), ("ep-0001", 46, "steps 2 to 45")):
+        with pytest.raises(ScenarioError, match=message):
+            continued(dataset, name, step)
+
+
+def test_a_proof_lies_within_the_horizon_from_the_mark(tmp_path):
+    folder = tmp_path / "r"
+    with cockpit(folder) as found, Client(found) as client:
+        client.start("push-left", seed=4)
+        client.act(np.full((5, 2), 0.5))
+        horizon = client.mark()["horizon"]
+        client.act(np.zeros((horizon - 1, 2)))
+        assert client.status["lacks"] == "not solved after the mark"
+        client.act(np.zeros((2, 2)))
+        push(client)
+        assert client.status["solved"]
+        assert not client.status["proven"]
+        with pytest.raises(TeleopRefusal, match="not solved within the horizon"):
+            client.finish()
+        client.finish(as_dropped=True)
+    store = Store(folder)
+    (path,) = store.paths()
+    late = read_recording(path)
+    assert late.lacks == "not solved within the horizon"
+    assert np.flatnonzero(late.solved)[0] - late.mark[0] > horizon
+    store.close()
+
+
+def test_lacking_counts_the_horizon_from_the_mark_inclusive():
+    solved = np.zeros(60, bool)
+    assert lacking(None, solved, 45) == "no recovery point marked"
+    solved[10 + 45] = True
+    assert lacking(10, solved, 45) == ""
+    assert lacking(10, solved, 44) == "not solved within the horizon"
+    assert lacking(55, solved, 45) == "not solved after the mark"
+
+
+def test_a_recording_of_an_earlier_version_is_held_against_the_horizon_when_written(tmp_path):
+    store, simulator = Store(tmp_path / "r"), make_simulator("fake", **view_options("fake", 16))
+    session = TeleopSession(simulator, "ann")
+    session.start(first_state("fake", "push-left", seed=4))
+    for _ in range(75):
+        session.act(np.array([0.1, 0.0]), "script")
+    late = replace(session.recorded("x", as_dropped=True), mark=(2, "", ""), lacks="")
+    late.solved[-1] = True
+    said = [
+        _as_candidate(late, simulator, Film(1, {})),
+        _as_candidate(replace(late, mark=None), simulator, Film(1, {})),
+    ]
+    assert [r.exclusion for r in said] == ["does not replay"] * 2
+    assert said[0].exclusion_detail == "not solved after 75 steps of the replay"
+    late.solved[-1] = False
+    assert _as_candidate(late, simulator, Film(1, {})).exclusion == "not solved within the horizon"
+    store.close()
+
+
+@pytest.mark.lerobot
+def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_path):
+    out, said = tmp_path / "set", []
+    folder = recordings_folder(out)
+    options = ("fake", {}, 32, said.append, 4)
+    check_open(out)
+    with cockpit(folder) as found, Client(found) as client:
+        client.start("push-left", seed=4)
+        client.act(np.full((5, 2), 0.5))
+        client.mark("Approach", "Wrong Pose")
+        push(client)
+        good = client.finish()
+        client.start("push-left", seed=6)
+        client.act(np.full((5, 2), 0.5))
+        client.mark()
+        bad = client.finish(as_dropped=True)
+    store = Store(folder)
+    assert write_dataset(out, store, *options)
+    made = read_candidates(out)
+    assert [c.id for c in made.candidates] == [good, bad]
+    assert {c.source.value for c in made.candidates} == {"human"}
+    assert [(s.step, s.by, s.stage) for s in made.candidates[0].suggestions] == [(5, "operator", "Approach")]
+    assert made.row(0).driver == "ann"
+    # Who renders its frames again (`validate`) does as was done here.
+    film = read_film(made.row(0).provenance, "here")
+    assert (film.every, film.options["observation_size"]) == (4, 32)
+    saved = read_recording(store.paths()[0])
+    assert made.actions(0).tobytes() == saved.actions.tobytes()
+    assert (made.steps(0).bodies["puck"] == saved.bodies["puck"]).all()
+    decided = [(d.candidate, d.verdict, d.reason) for d in read_decisions(out)]
+    assert decided == [(good, "kept", ""), (bad, "dropped", "not solved after the mark")]
+    store.close()
+    # A later session adds to it; a recording that does not replay is dropped with the distance.
+    with cockpit(folder) as found, Client(found) as client:
+        client.start("push-left", seed=7)
+        client.act(np.full((5, 2), 0.5))
+        client.mark()
+        push(client)
+        client.finish()
+    store = Store(folder)
+    path = store.paths()[2]
+    kept = read_recording(path)
+    kept.bodies["puck"][3, 0] += 0.01
+    store.add(kept, 3)
+    assert write_dataset(out, store, *options)
+    assert read_decisions(out)[-1].reason == "does not replay"
+    assert read_decisions(out)[-1].detail.startswith("10 mm off")
+    assert len(read_candidates(out)) == 3
+    assert [p.name for p in sorted(folder.glob("part-*"))] == ["part-000001-000003"]
+    record_decisions(out, [Decision(good, "screen", "kept")])
+    for refused in (lambda: check_open(out), lambda: write_dataset(out, store, *options)):
+        with pytest.raises(ScenarioError, match="being worked on"):
+            refused()
+    store.close()
+
+
+def test_a_recording_of_before_the_simulator_marked_more_still_replays():
+    from lerobot_roborecover.web.teleop.write import _replay
+
+    simulator = make_simulator("fake")
+    session = TeleopSession(simulator, "ann")
+    session.start(first_state("fake", "push-left", seed=5))
+    for _ in range(4):
+        session.act(np.full(2, 0.5), "keyboard")
+    whole = session.recorded("it", as_dropped=True)
+    earlier = replace(whole, bodies={name: whole.bodies[name] for name in list(whole.bodies)[:1]})
+    assert len(earlier.bodies) < len(simulator.bodies())
+    assert _replay(earlier, simulator)[0] == 0.0
+
+
+# --- starts and pictures
+
+
+class Eyes:
+    """A page's connection, message by message."""
+
+    def __init__(self, address):
+        self.socket = connect(socket_address(address), proxy=None)
+        self.status, self.pictures = {}, []
+
+    def read(self, until, seen=True):
+        """Takes messages until a status fits or a picture comes; says that pictures were shown."""
+        while True:
+            said = self.socket.recv(timeout=PATIENCE_S)
+            if isinstance(said, bytes):
+                self.pictures.append(said)
+                continue
+            message = json.loads(said)
+            if message["type"] == "shown" and seen:
+                self.say("seen")
+            if message["type"] == "status":
+                self.status = message
+            if until(message):
+                return message
+
+    def say(self, kind, **values):
+        self.socket.send(json.dumps({"type": kind, **values}))
+
+
+def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_path, monkeypatch):
+    starts = [first_state("fake", "push-left", seed=s) for s in (3, 4)]
+    # The first start takes as long to load as the page takes to come.
+    seen, reset = threading.Event(), FakeSimulator.reset
+
+    def slow(simulator, *start):
+        assert seen.wait(PATIENCE_S)
+        reset(simulator, *start)
+
+    monkeypatch.setattr(FakeSimulator, "reset", slow)
+    with cockpit(tmp_path / "r", starts) as found:
+        eyes = Eyes(found)
+        loading = eyes.read(lambda m: m.get("phase") == "loading")
+        seen.set()
+        assert loading["instruction"] == starts[0].task.instruction
+        assert not eyes.read(lambda m: m.get("phase") == "preview")["under_way"]
+        assert eyes.read(lambda m: m["type"] == "shown")["scene"] == eyes.status["scene"]
+        for kind in ("mark", "act", "back", "gripper", "finish"):
+            eyes.say(kind, id=1)
+            assert "only shown yet" in eyes.read(lambda m: m["type"] == "reply")["message"]
+        eyes.say("start", number=0)
+        assert eyes.read(lambda m: m.get("under_way"))["number"] == 0
+        eyes.say("act", actions=[[0.5, 0.5]])
+        eyes.say("discard")
+        assert eyes.read(lambda m: m.get("phase") == "preview")["number"] == 0
+        eyes.say("preview", number=1)
+        shown = eyes.read(lambda m: m.get("phase") == "preview" and m["number"] == 1)
+        assert shown["label"] == starts[1].label
+        # A picture says which start it is of: the last one's is not taken for this one's.
+        eyes.read(lambda m: m["type"] == "shown" and m["scene"] == shown["scene"])
+        eyes.say("start", number=1)
+        eyes.say("act", actions=[[0.5, 0.5]])
+        eyes.say("finish", as_dropped=True)
+        assert eyes.read(lambda m: m.get("saved") == 1 and m.get("phase") == "idle")["number"] is None
+        eyes.socket.close()
+    # A later session goes on with what is not saved yet.
+    with cockpit(tmp_path / "r", starts) as found:
+        eyes = Eyes(found)
+        assert eyes.read(lambda m: m.get("phase") == "preview")["number"] == 0
+        eyes.socket.close()
+
+
+def test_nobody_drives_blind(tmp_path):
+    """Steps wait for pictures that the driver has not shown yet, whatever others have."""
+    with cockpit(tmp_path / "r", [first_state("fake", "push-left", seed=3)]) as found:
+        eyes = Eyes(found)
+        eyes.read(lambda m: m.get("phase") == "preview")
+        eyes.read(lambda m: m["type"] == "shown")
+        eyes.say("start", number=0)
+        eyes.read(lambda m: m.get("under_way"))
+        eyes.say("realtime", on=True)
+        eyes.read(lambda m: m["type"] == "shown", seen=False)  # and is never said to be seen
+        held = eyes.status["step"]
+        watcher = Eyes(found)
+        watcher.read(lambda m: m["type"] == "status")
+        assert watcher.status["role"] == "watch"
+        watcher.read(lambda m: m["type"] == "shown")
+        time.sleep(0.8)
+        eyes.say("status", id=9)
+        step = eyes.read(lambda m: m.get("id") == 9)["status"]["step"]
+        assert step <= held + most_unseen(20.0, 15.0)
+        eyes.say("seen")
+        eyes.read(lambda m: m.get("step", 0) > step)
+        for each in (eyes, watcher):
+            each.socket.close()
+
+
+# --- who may ask, and for what
+
+
+def socket_address(address: str, query: str = f"?token={TOKEN}") -> str:
+    return address.replace("http://", "ws://").split("?")[0] + "socket" + query
+
+
+def test_only_the_page_with_the_token_gets_in(address):
+    base, host = address.split("?")[0], address.split("/")[2]
+    with httpx.Client(trust_env=False) as client:
+        assert client.get(base).status_code == 403
+        assert client.get(f"{base}?token={'x' * 32}").status_code == 403
+        assert client.get(address, headers={"Host": "evil.example"}).status_code == 421
+        answer = client.get(address)
+        assert answer.status_code == 303
+        assert "httponly" in answer.headers["set-cookie"].lower()
+        assert client.get(base).status_code == 200
+        for path in ("..%2fpilot.py", "pilot.py", "%2e%2e/server.py", "app.js/"):
+            assert client.get(base + path).status_code == 404
+        cookie = answer.headers["set-cookie"].split(";")[0]
+    plain, keyed = socket_address(address, ""), socket_address(address)
+    refused = (
+        (plain, {}),
+        (socket_address(address, "?token=wrong"), {}),
+        (keyed, {"Origin": "http://evil.example"}),
+        (keyed, {"Origin": "null"}),
+        (plain, {"Cookie": cookie, "Origin": f"http://{host}0"}),
+        (keyed.replace("127.0.0.1", "localhost"), {}),
+    )
+    for url, headers in refused:
+        with pytest.raises(InvalidStatus), connect(url, additional_headers=headers, proxy=None):
+            pass
+    own = {"Cookie": cookie, "Origin": f"http://{host}"}
+    with connect(plain, additional_headers=own, proxy=None) as good:
+        assert json.loads(good.recv())["type"] == "hello"
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        ("no json", "not JSON"),
+        ("[1]", "not a JSON object"),
+        ("[" * 30_000, "not JSON"),
+        (b"\x00\x01", "are text"),
+        ('{"type": "shutdown"}', "'shutdown' is not one of start"),
+        ('{"type": 3}', "with a type"),
+        ('{"type": "hold"}', "axes must be 6 finite numbers"),
+        ('{"type": "hold", "axes": [0, 0, 0, 0, 0, NaN]}', "axes must be 6"),
+        ('{"type": "hold", "axes": [0, 0, 0, 0, 0, 1.5]}', "from -1 to 1"),
+        ('{"type": "hold", "axes": [true, 0, 0, 0, 0, 0]}', "axes must be 6"),
+        (f'{{"type": "hold", "axes": [0, 0, 0, 0, 0, 1{"0" * 400}]}}', "from -1 to 1"),
+        (f'{{"type": "act", "actions": [[0, -1{"0" * 400}]]}}', "a list of 2 numbers"),
+        (f'{{"type": "back", "steps": 1{"0" * 400}}}', "from 1 to"),
+        ('{"type": "act"}', "a list of 1 to 256"),
+        ('{"type": "act", "actions": [[0, 0, 0]]}', "2 numbers"),
+        ('{"type": "act", "actions": [[0, 0], [0, 1.01]]}', "value 1 is 1.01"),
+        ('{"type": "act", "actions": [[Infinity, 0]]}', "value 0 is inf"),
+        ('{"type": "act", "actions": [["x", 0]]}', "a list of 2 numbers"),
+        ('{"type": "act", "actions": [[1e400, {}]]}', "a list of 2 numbers"),
+        ('{"type": "back", "steps": -4}', "from 1 to"),
+        ('{"type": "back", "steps": 1.5}', "whole number"),
+        ('{"type": "start", "number": 0}', "lists no starts"),
+        ('{"type": "start", "task": "push-left", "seed": -1}', "seed must be"),
+        ('{"type": "start", "task": 7}', "task must be text"),
+        ('{"type": "mark", "stage": ["a"]}', "stage must be text"),
+        ('{"type": "gripper"}', "no gripper"),
+        ('{"type": "hand_back"}', "nobody waits"),
+        ('{"type": "status", "id": "x"}', "id must be"),
+    ],
+)
+def test_a_bad_message_is_refused_in_words_and_nothing_else_happens(address, sent, why):
+    with Client(address) as client:
+        client.start("push-left", seed=3, discard=True)
+        client.act([0.5, 0.5])
+        client._socket.send(sent)
+        while (said := json.loads(client._receive()))["type"] != "reply":
+            pass
+        assert not said["ok"]
+        assert why in said["message"]
+        client.look()
+        assert client.status["step"] == 1
+
+
+def test_a_message_too_large_ends_the_connection_and_only_that(address):
+    with Client(address) as client:
+        with pytest.raises(ScenarioError, match=r"connection to the simulator's server broke .*too big"):
+            client.ask("x" * MAX_SOCKET_MESSAGE_BYTES)
+        with pytest.raises(ScenarioError, match=r"connection to the simulator's server broke .*too big"):
+            client.look()
+    with Client(address) as client:
+        assert client.look() is not None
+
+
+def test_a_simulator_that_breaks_ends_its_recording_and_not_the_server(tmp_path):
+    with cockpit(tmp_path / "r") as found, Client(found) as client:
+        client.start("raises", suite="faults")
+        client.act(np.zeros((19, 2)))
+        with pytest.raises(TeleopRefusal, match="broke on purpose"):
+            client.act([0, 0])
+        with pytest.raises(TeleopRefusal, match="start a task first"):
+            client.finish(as_dropped=True)
+        client.start("push-left")
+        assert client.act([0, 0])["step"] == 1
+
+
+def test_whoever_watches_does_not_drive(address):
+    with Client(address) as first, Client(address) as second:
+        with pytest.raises(TeleopRefusal, match="somebody else drives"):
+            first.act([0, 0])
+        second.start("push-left", seed=1, discard=True)
+        first.ask("drive")
+        assert first.act([0, 0])["step"] == 1
