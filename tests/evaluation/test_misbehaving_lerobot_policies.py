@@ -91,6 +91,7 @@ def test_what_evaluate_makes_of_bad_tensors(dataset, checkpoints, spoil, kind, n
         assert all(words in r.reason for r in rows), rows[0].reason
 
 
+@pytest.mark.nightly
 def test_evaluate_comes_back_from_a_policy_that_blocks(dataset, checkpoints, spoil, caplog):
     release = threading.Event()
     spoil("act", lambda tensor: release.wait())

@@ -233,7 +233,7 @@ def test_a_pair_of_get_and_set_is_the_state(toys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["lerobot_pusht", "lerobot_aloha"])
+@pytest.mark.parametrize("name", ["lerobot_pusht", pytest.param("lerobot_aloha", marks=pytest.mark.nightly)])
 def test_the_contract_holds(name):
     platform = platform_named(name)
     request = CheckRequest(name, tuple(platform.tasks()), {"obs_type": "state"}, steps=20)

@@ -44,8 +44,8 @@ def reproduce(config, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_score_that_is_reached_is_confirmed_after_an_interruption(reproduce, capfd):
-    """A random policy solves nothing, which is what is published; the run goes on where it was stopped."""
+def test_a_score_that_is_reached_is_confirmed(reproduce, capfd):
+    """A random policy solves nothing, which is what is published."""
     status, found, out = reproduce("--published", "0,0,1", "--margin", "99")
     assert status == 0
     assert (found["standing"], found["confirmed"]) == ("agrees", True)
@@ -54,13 +54,19 @@ def test_a_score_that_is_reached_is_confirmed_after_an_interruption(reproduce, c
     page = (out / "reproduction.md").read_text()
     assert "**Confirmed.**" in page
     assert "roborecover eval --config_path=" in page
-    log = out / "recovery" / "trials.jsonl"
-    whole = log.read_bytes()
-    assert {row.start for row in read_trial_log(log)} == {"recovery"}
+    assert {row.start for row in read_trial_log(out / "recovery" / "trials.jsonl")} == {"recovery"}
     # Nothing is left to do: no run is started.
     capfd.readouterr()
     assert reproduce("--published", "0,0,1", "--margin", "99")[0] == 0
     assert "roborecover eval" not in capfd.readouterr().out
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_a_run_that_was_killed_goes_on(reproduce):
+    _, found, out = reproduce("--published", "0,0,1", "--margin", "99")
+    log = out / "recovery" / "trials.jsonl"
+    whole = log.read_bytes()
     # As if it had been killed in the recovery arm.
     (out / "recovery" / "done.json").unlink()
     log.write_bytes(b"".join(whole.splitlines(keepends=True)[:3]))
