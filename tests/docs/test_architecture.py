@@ -33,10 +33,10 @@ def files_in(text: str) -> list[str]:
 
 def rows_of_contributing() -> Iterator[tuple[list[str], str]]:
     """Paths in the first column of "Where things live", and the second column."""
-    section = (
-        (ROOT / "CONTRIBUTING.md").read_text("utf-8").split("## Where things live\n")[1].split("\n\n")[1]
-    )
-    for line in section.splitlines()[2:]:
+    page = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    section = page.split("## Where things live\n")[1].split("\n## ")[0]
+    _, _, *rows = [line for line in section.splitlines() if line.startswith("|")]
+    for line in rows:
         _, first, second, _ = line.split("|")
         yield code_spans(first), second
 
@@ -56,11 +56,11 @@ def test_a_file_of_the_page_exists(name):
 
 
 def test_files_and_folders_of_contributing_exist():
-    missing, folder = [], ROOT
+    missing, folder = [], PACKAGE
+    assert len(list(rows_of_contributing())) > 20
     for paths, about in rows_of_contributing():
         for path in paths:
-            # `a/b.py`, `c.py`: what has no folder is beside the one before.
-            found = next((f for f in (ROOT / path, folder / path) if f.exists()), None)
+            found = next((f for f in (ROOT / path, PACKAGE / path) if f.exists()), None)
             if found is None:
                 missing.append(path)
                 continue
