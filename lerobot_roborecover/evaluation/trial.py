@@ -1,4 +1,4 @@
-"""The life of one trial, from its reset to its row; the one account of it, whoever runs the loop.
+"""State machine of one trial, from its reset to its row, shared by both evaluation loops.
 
     NEW -> HANDING_OFF -> WAITING -> ASKED -> ACTING -> WAITING ... -> OVER
                                            -> GOING_BACK -> WAITING
@@ -65,7 +65,7 @@ class TrialState(StrEnum):
     """Where a trial is."""
 
     NEW = "new"
-    """Nothing has been asked of anybody."""
+    """No request has been sent yet."""
     HANDING_OFF = "handing_off"
     """A simulator rebuilds its start."""
     WAITING = "waiting"
@@ -287,7 +287,7 @@ class Trial:
         self._end(outcome, reason)
 
     def skip(self, *, success: bool = False, steps: int = 0) -> None:
-        """Ends it before it begins, without a row: an earlier run finished it, or nobody asked for it.
+        """Ends it before it begins, without a row: an earlier run finished it, or it was not requested.
 
         Args:
             success: how it ended then.
