@@ -350,7 +350,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class TrialStart:
-    """What a trial starts from: a rollout under a name, after which somebody takes over.
+    """What a trial starts from: a rollout under a name, after which the policy takes over.
 
     It needs no labels: a scenario has them, the first state of a task has none.
     """

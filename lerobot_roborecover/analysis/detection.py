@@ -1,10 +1,12 @@
-"""What a detector says of whole trials, and what follows: who needs help, how soon it is seen, and what false
-alarms cost.
+"""Evaluates a detector on whole trials: which trials it flags, how early, and what false alarms cost.
 
-Two labels of a frame. `deviated` is the paper's: 0 before the recovery point, 1 from it on. `needs help` asks
-whether the policy that acts recovers by itself: of frames from the recovery point on, 1 in a trial that fails
-and 0 in one that succeeds; 0 in successful clean rollouts; frames before the recovery point, where the policy
-did not act, and clean rollouts that fail, of which nobody knows where they go wrong, have none.
+A frame has two labels. `deviated` is the paper's: 0 before the recovery point, 1 from it on. `needs help` is
+the failure label: whether the acting policy fails to recover by itself.
+
+- Frames from the recovery point on: 1 in a trial that fails, 0 in a trial that succeeds.
+- Frames of successful clean rollouts: 0.
+- Frames before the recovery point: no label, because the policy did not act there.
+- Frames of clean rollouts that fail: no label, because the step at which they go wrong is unknown.
 """
 
 from __future__ import annotations

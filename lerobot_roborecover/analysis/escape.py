@@ -1,6 +1,6 @@
-"""Text from logs, made safe for what it is written into. HTML is escaped by Jinja (`analysis/page.py`).
+"""Escapes text from logs for Markdown, CSV and LaTeX. Jinja escapes HTML (`analysis/page.py`).
 
-Names of policies, scenarios and tasks come from whoever made a log; none may become markup or a formula.
+Names of policies, scenarios and tasks in a log are untrusted; none may become markup or a formula.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The gain of stepping in against the step at which somebody does, of all scenarios and by cell."""
+"""Plots the gain of an intervention against its step, over all scenarios and by cell."""
 
 from __future__ import annotations
 
@@ -75,5 +75,5 @@ def gain_by_step(gains: ForkGains) -> Figure:
         for arm in gains.arms
     }
     words = "; ".join(f"{arm} {number(100 * v, '+.1f')} at step {s}" for arm, (s, v) in best.items())
-    text = f"Recovery gain against the step at which somebody steps in. Largest, all cells together: {words}."
+    text = f"Recovery gain against the step of the intervention. Largest, all cells together: {words}."
     return Figure("fork_gain", "When stepping in pays", text, *both(draw))

@@ -32,7 +32,7 @@ from lerobot_roborecover.scenario import Outcome, ScenarioError, Start
 FORK = "fork"
 """Entry of a row's `options` that says which fork it is."""
 CONTINUE = "continue"
-"""The arm in which nobody steps in."""
+"""The arm without an intervention: the same policy goes on."""
 MATCHED = "matched"
 """The random stream of forks that are compared: one new stream for all arms."""
 
@@ -215,7 +215,7 @@ def gain_tables(gains: ForkGains) -> list[Table]:
     """All forks, by step, by cell, and by both."""
     arms, steps, cells = gains.arms, gains.steps, gains.cells
     notes = (
-        "Gain: success when somebody steps in, less success when the same policy continues from the same "
+        "Gain: success with the intervention, less success when the same policy continues from the same "
         "step of the same trial. Every scenario counts the same; intervals (95 %) speak of "
         f"{ESTIMAND[gains.unit]}. They are not adjusted for the number of rows: a row that was picked by its "
         "gain is to be tried on other scenarios.",

@@ -45,8 +45,10 @@ ESTIMAND = {
 
 
 def default_unit(platform: str) -> ResamplingUnit:
-    """What is resampled on a platform where nobody says otherwise (paper, appendix "Statistical analysis"):
-    trajectory clusters where several scenarios come of one trajectory, else scenarios."""
+    """Returns a platform's default resampling unit (paper, appendix "Statistical analysis").
+
+    The unit is the trajectory cluster where several scenarios come from one trajectory, else the scenario.
+    """
     try:
         return ResamplingUnit.TRAJECTORY if platform_named(platform).clustered else ResamplingUnit.SCENARIO
     except ScenarioError:  # logs are read on machines that do not have their platform

@@ -28,7 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy; ? lists them")
-    add("--name", default="", help="recorded name of whoever drives (checkpoint, or expert)")
+    add("--name", default="", help="recorded name of the driver (checkpoint, or expert)")
     add("--out", type=Path, metavar="DIR", help="folder of the candidate dataset; needed to collect")
     add("--work", type=Path, metavar="DIR", help="folder of the rollouts, kept (OUT.work)")
     add(

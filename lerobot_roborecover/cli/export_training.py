@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"left out: {count} {reason}")
     print(
         f"{made.episodes} episodes ({made.successes} succeed), {made.frames} frames, {made.interventions} of "
-        f"them by somebody who stepped in\n\nlerobot-train --dataset.repo_id=local/training "
+        f"them by an intervention\n\nlerobot-train --dataset.repo_id=local/training "
         f"--dataset.root={args.out} --policy.type=... --output_dir=...\n"
         f"with RA-BC ({PROGRESS_FILE}): --sample_weighting.type=rabc"
         + ("" if made.progress_known else " --sample_weighting.head_mode=dense")

@@ -74,7 +74,7 @@ class Suggestion:
     step: int
     reason: str
     by: str
-    """The rule, the model, or `operator` for whoever drove."""
+    """The rule, the model, or `operator` for the person who drove."""
     stage: str = ""
     """A `Stage`, or empty."""
     deviation: str = ""

@@ -1,4 +1,4 @@
-"""How a candidate was filmed, as its provenance says: whoever renders its frames again must do likewise."""
+"""Render settings of a candidate's video, from its provenance. Rendering it again uses the same settings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Film:
 
 
 def read_film(provenance: Mapping[str, Any], where: str) -> Film:
-    """What a rollout's provenance says, in the notes of whoever recorded it; every step where it is silent.
+    """Reads the render settings from a rollout's provenance; a frame at every step where it has none.
 
     Raises:
         ScenarioError: the note is none of `Film.note`'s.

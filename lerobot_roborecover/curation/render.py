@@ -1,7 +1,7 @@
-"""Renders a scenario dataset's prefixes as episodes: the LeRobotDataset that building ends in.
+"""Renders a scenario dataset's prefixes as episodes: the last stage of a build writes this LeRobotDataset.
 
-Scenarios are evaluated without episodes; whoever wants to look at them, or train on them, has them here. What
-earlier stages decided and recorded comes along.
+An evaluation needs no episodes; they are for viewing and training. The decisions and records of the earlier
+stages are copied into the dataset.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ class BlockingEncoder(StreamingVideoEncoder):
         Raises:
             ScenarioError: the encoder has died.
         """
-        # Full, LeRobot's own waits 0.1 s and drops; it is asked only once there is room, which nobody but
-        # this thread takes up.
+        # When its queue is full, LeRobot's encoder waits 0.1 s and then drops the frame. So `_put` waits for
+        # room, which no other thread takes up.
         self._put(video_key, np.array(image))
 
     def finish_episode(self) -> dict[str, tuple[Path, dict | None]]:

@@ -53,7 +53,7 @@ def license_metadata(license: object) -> dict[str, str]:
 
 
 def license_argument(text: str) -> str:
-    """A licence on the command line, as given; refused there where nobody knows it."""
+    """Returns a licence from the command line as given; refuses one that `license_metadata` refuses."""
     try:
         license_metadata(text)
     except ScenarioError as err:

@@ -127,7 +127,7 @@ def _said(err: Exception, attempts: int) -> str:
         return f"the token may not do this (HTTP 403). {_LOGIN}: with write access, for an organisation"
     if status in (409, 412):
         return (
-            f"somebody else changed it at the same time (HTTP {status}). Look at what they did, then run the "
+            f"another commit changed it at the same time (HTTP {status}). Look at that commit, then run the "
             "command again"
         )
     if status == 429:

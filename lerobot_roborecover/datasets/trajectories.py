@@ -116,8 +116,8 @@ def read_trajectories(root: str | os.PathLike[str], *, videos: bool = True) -> T
 
     Args:
         root: the dataset's folder.
-        videos: refuse one whose videos have another number of frames than steps; False for whoever looks at
-            the metadata alone.
+        videos: refuse a dataset whose videos have another number of frames than steps; False reads the
+            metadata alone.
 
     Raises:
         ScenarioError: names the file and the field.

@@ -1,10 +1,9 @@
-"""Counts a dataset's video frames against its steps, from the videos themselves.
+"""Checks that a dataset's videos have one frame per step and camera, on LeRobot's timestamps.
 
-An encoder that cannot keep up may leave frames out, and whoever reads such a video by time is then shown the
-next episode's first frame as the last of this one, without a word. Every episode therefore has exactly one
-frame of each camera for each of its steps, on LeRobot's grid of times; a dataset for which that does not hold
-is neither written nor read, validated or published. Nothing is decoded: counting takes microseconds a frame,
-and where a file's header already says it, not even that. LeRobot is not imported.
+An encoder that cannot keep up may drop frames. A reader that seeks by time then silently gets the next
+episode's first frame as the last frame of this episode. A dataset that fails this check is not written, read,
+validated or published. Nothing is decoded: counting takes microseconds a frame, and nothing at all where the
+file's header has the count. LeRobot is not imported.
 """
 
 from __future__ import annotations

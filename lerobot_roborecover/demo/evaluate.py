@@ -1,4 +1,4 @@
-"""Runs `lerobot-eval` itself, as anybody would, and watches its trial log."""
+"""Runs `lerobot-eval` in a process of its own, as a user would, and watches its trial log."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ class ForkedTrial:
     row: TrialRow
     """Of its last continuation, which up to the last fork is the trial itself."""
     gains: Mapping[int, float]
-    """By step from the handoff: success when somebody steps in, less success when the policy goes on; over
-    random streams the mean."""
+    """By step from the handoff: success with an intervention, less success when the policy goes on; the mean
+    over random streams."""
 
 
 @dataclass(frozen=True)

@@ -80,8 +80,8 @@ def fork_logs(
         links: what is measured on.
 
     Raises:
-        MonitorError, ScenarioError: the log is missing, of another policy, or of what is measured on; or
-            nobody learns from it.
+        MonitorError, ScenarioError: the log is missing, of another policy, or of the scenarios measured on;
+            or no detector learns from it.
     """
     from lerobot_roborecover.evaluation.loading import policy_config
 

@@ -1,10 +1,12 @@
-"""How long the trials that wait for a policy wait for others to be asked about with them.
+"""Decides how long trials that wait for a policy wait for others to join their batch.
 
-There are two good ways to share a policy. Either whoever is ready is asked about while the others step: two
-halves take turns. Or all are asked about together. With n slots, inferences of l + e b seconds for b
-observations, and s seconds of simulation from an answer to the next question, a round of all takes
-max(s + l + e n / 2, 2 l + e n) by halves and s + l + e n together. So together is better where s < l, and
-halves where s > l, whatever e is.
+A policy can be shared in two good ways. In halves: the trials that are ready form a batch while the others
+step, so two halves take turns. Together: all trials form one batch.
+
+Let n be the number of slots, l + e b the seconds of an inference for b observations, and s the seconds of
+simulation between an answer and the next observation. A round of all slots then takes
+max(s + l + e n / 2, 2 l + e n) in halves and s + l + e n together. So one batch is faster where s < l, and
+halves are faster where s > l, for every e.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ class BatchTimer:
             limit: most observations in a batch.
 
         Returns:
-            A time that is past where nobody is worth waiting for.
+            The latest time to wait until; a time in the past when the batch should be sent now.
         """
         first, everybody = min(waiting), len(waiting) + len(acting)
         if len(waiting) >= limit or not (acting or handing_off):

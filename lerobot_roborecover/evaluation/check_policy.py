@@ -155,7 +155,7 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
 
 
 def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, EvalSession]:
-    """The scenarios and a run whose trial log nobody keeps."""
+    """Loads the scenarios and opens a run whose trial log is in a temporary folder."""
     folder = TemporaryFolder("check")
     log = f"{folder.path}/trials.jsonl"
     facts = policy_metadata(cfg.policy, rename_map=cfg.rename_map, n_episodes=cfg.eval.n_episodes)

@@ -104,7 +104,7 @@ def _register_all() -> tuple[dict[str, type[RecoveryEnvConfig]], dict[str, str]]
             continue  # another's env type serves it
         try:
             found[platform.name] = _env_type(platform)
-        except Exception as err:  # somebody else's platform must not take LeRobot's programs down
+        except Exception as err:  # a third-party platform must not break LeRobot's programs
             unusable[platform.name] = f"{type(err).__name__}: {err}"
             _LOG.warning("platform %r has no usable env config: %s", platform.name, unusable[platform.name])
     return found, unusable

@@ -23,7 +23,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         split: that the scenarios were loaded with.
 
     Raises:
-        OptionError: the id is none, or the set is a folder, which nobody else has.
+        OptionError: the id is invalid, or the set is a local folder, which other users do not have.
         OutputExistsError: `out` holds an `env.py` or a card that this command did not write.
     """
     if not HUB_ID.fullmatch(repo_id):

@@ -70,7 +70,7 @@ class InterventionRecord:
         told.highest = max(directive.score, directive.score if math.isnan(told.highest) else told.highest)
 
     def acted(self, directive: ControlColumns) -> None:
-        """Counts an executed action for whoever chose it."""
+        """Counts an executed action for the controller that chose it."""
         if directive.controller in _KINDS:
             self._entries[-1]["steps"] += 1
 

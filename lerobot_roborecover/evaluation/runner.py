@@ -81,8 +81,8 @@ class RunnerOptions:
     replicas: int = 0
     """Copies of the policy on a Ray cluster; 0 takes one per GPU, or a single one for a policy on the CPU."""
     sequential: str = ""
-    """A trial log to compare with while the run goes: it stops as soon as the comparison is decided. `alone`
-    compares with nobody, and shows an interval that holds whenever it is looked at."""
+    """Trial log to compare with during the run, which stops as soon as the comparison is decided. `alone`
+    compares with no other log and shows an interval that is valid at any time."""
     retry: str = ""
     """Run trials of these outcomes again (`policy_error,timeout,sim_error`); their old rows are kept beside
     the trial log, in `<log>.retried.jsonl`."""
@@ -158,7 +158,7 @@ class RecoveryEvalConfig(EvalPipelineConfig):
     @property
     def folder(self) -> Path:
         """`output_dir`."""
-        assert self.output_dir is not None, "LeRobot sets it where nobody did"
+        assert self.output_dir is not None, "LeRobot sets it where the user does not"
         return Path(self.output_dir)
 
 

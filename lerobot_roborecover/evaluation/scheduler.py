@@ -1,12 +1,12 @@
-"""The engine: every slot busy, policies shared, results in the trial log as they come.
+"""Evaluation engine: keeps every slot busy, shares policies, and writes each result to the trial log at once.
 
-One loop over events. A seat (a slot and the trial it runs) goes round:
+The engine is one event loop. A slot goes through these states:
 
-    idle -> its trial's states (`trials.trial`), from handing off to over -> idle
+    idle -> its trial's states (`evaluation.trial`), from handing off to over -> idle
 
-Whoever waits is asked about together; a seat whose trial is over takes the next unit at once. While a policy
-infers for some seats the simulators of the others work. Where slots and policies live is the business of the
-parts the engine is given: this process and its children (`local`), or a cluster (`ray_engine`).
+Waiting trials share one batch. A free slot starts the next trial at once. While a policy infers for some
+slots, the simulators of the others step. The engine gets its slots and policies from outside: from this
+process and its children (`local`), or from a cluster (`ray_engine`).
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Engine:
         while not stop():
             self._fill()
             events = self._events()
-            # Whoever has replied meanwhile joins the batch, or takes its next unit, before a policy is asked.
+            # Before a policy infers, slots that have replied join the batch or start their next trial.
             if self._collect(events, 0.0) or any(self._ask(r) for r in self._replicas):
                 continue
             if not events:
@@ -187,7 +187,7 @@ class Engine:
         return True
 
     def _ask_at(self, replica: Replica) -> float | None:
-        """When a replica is to be asked; None where nobody waits for it, or it cannot be asked."""
+        """Returns when to send a batch to a replica; None where no trial waits for it, or it is busy."""
         if replica.opening or replica in self._asked:
             return None
         mine = self._sittings_of(replica)
@@ -314,8 +314,10 @@ class Engine:
         self._run_again(sitting)
 
     def _away(self, sitting: ActiveTrial, reason: str) -> None:
-        """Nobody could ask the policy, so nothing is known of it: the trial is run again from its start, and
-        in the end left without a row, for a run that finds the policy there."""
+        """Handles a policy that could not be reached: the trial is run again from its start.
+
+        After `MAX_ATTEMPTS` losses the trial is left without a row, for a later run.
+        """
         unit = sitting.unit
         if self._lost_again(sitting):
             self.unrun[unit.scenario.id, unit.trial] = reason

@@ -6,7 +6,7 @@ decided.
    counts no earlier for it, and what slots have run ahead does not count at all.
 3. The line shows the rate and, against another policy's log, the difference with their confidence sequences.
    When the sequential test has decided the run stops.
-4. `trials.sequential.json` beside the log says so to whoever reads the log later.
+4. `trials.sequential.json` beside the log records this for later readers of the log.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lerobot_roborecover.logs.trial_log import read_log
 from lerobot_roborecover.scenario import Scenario, Start
 
 ALONE = "alone"
-"""Value of `--runner.sequential` that compares with nobody."""
+"""Value of `--runner.sequential` that compares with no other log."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Watch(RunProgress):
         scenarios: of the run.
         protocol: of the run.
         trials: of every scenario.
-        reference: whom to compare with, if anybody.
+        reference: the trials to compare with; None compares with none.
         level: confidence level.
     """
 

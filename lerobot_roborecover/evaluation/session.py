@@ -61,7 +61,7 @@ class EvalSession:
     pool: SlotPool
     protocol: EvalProtocol
     log: RowLog | None
-    """None where nobody keeps the rows."""
+    """None where the rows are not stored."""
     dataset: str
     dataset_revision: str | None
     handoff_check: bool = True
@@ -278,7 +278,7 @@ def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str
 
 
 def _without_pictures(scenario: Scenario) -> Scenario:
-    """Nobody looks at recorded frames in a run: they would fill its memory and travel to every worker."""
+    """Drops the recorded frames: a run does not read them, and they would be sent to every worker."""
     mark = scenario.fingerprint
     return scenario if mark is None else replace(scenario, fingerprint=replace(mark, frames_png=()))
 
@@ -326,7 +326,7 @@ def _check_batch(facts: PolicyMetadata) -> None:
             "slot an instance that shares the weights"
         )
     if facts.lerobots_batch:
-        return  # nobody asked for it, and the trials beyond the number cost no simulator
+        return  # the size is LeRobot's default, and the trials beyond the number cost no simulator
     if facts.n_episodes and facts.batch_size and facts.n_episodes % facts.batch_size:
         divisors = [d for d in range(1, facts.n_episodes + 1) if facts.n_episodes % d == 0]
         if facts.batch_size > facts.n_episodes:
@@ -394,7 +394,7 @@ def _check_versions(scenarios: ScenarioSet, platform: str, assets: Mapping[str, 
             "versions that decide scores differ: "
             + "; ".join(problems)
             + ". Install the versions named, or accept "
-            "scores that compare with nobody else's: --env.strict_versions=false"
+            "scores that cannot be compared with others': --env.strict_versions=false"
         )
     for problem in problems:
         logger.warning("scores will not compare with others': %s", problem)

@@ -1,19 +1,21 @@
-"""The life of one trial, from its reset to its row; the one account of it, whoever runs the loop.
+"""State machine of one trial, from its reset to its row, shared by both evaluation loops.
 
     NEW -> HANDING_OFF -> WAITING -> ASKED -> ACTING -> WAITING ... -> OVER
                                            -> GOING_BACK -> WAITING
 
-1. `begin`: what a simulator needs to rebuild the start. It replays, compares and observes.
-2. `ask`: the policy is asked about the observation. A handoff that was not faithful never comes here: the
-   trial is over before the policy sees anything.
-3. `decide`: the policy's actions, or its wish to go back. A bad action is found here and never sent.
-4. `take`: what the simulator replied. Steps are counted, actions hashed, success is the task's own predicate.
-5. `OVER`, with an outcome: success, out of steps, or why it is invalid. `row` says all of it.
+1. `begin` returns what a simulator needs to rebuild the start. The simulator replays, compares and observes.
+2. `ask` returns the observation for the policy. After an unfaithful handoff the trial ends before this step,
+   so the policy sees nothing of it.
+3. `decide` takes the policy's actions, or its request for a rollback. It rejects a bad action, which is never
+   sent.
+4. `take` takes the simulator's reply. It counts steps and hashes actions; the task's predicate decides
+   success.
+5. `OVER` has an outcome: success, horizon reached, or the reason why the trial is invalid. `row` returns it.
 
-`skip` and `fail` end a trial from wherever it is. Pure: no clock, no process, no file. Two loops drive it:
-`env.vector_env` for LeRobot's, one action at a time, and `trials.engine` for ours, chunk by chunk; the same
-policy gives the same row in both, because a chunk counts as its actions one by one. Where the clock does not
-stop (`real_time`), `decide` puts what was executed while the policy thought before its actions.
+`skip` and `fail` end a trial in any state. The state machine has no clock, process or file. Two loops drive
+it: `evaluation.vector_env` (LeRobot's loop) one action at a time, and `evaluation.scheduler` chunk by chunk.
+The same policy gives the same row in both, because a chunk counts as its single actions. In real-time
+evaluation (`real_time`), `decide` puts the actions executed during the inference before the policy's actions.
 """
 
 from __future__ import annotations
@@ -65,7 +67,7 @@ class TrialState(StrEnum):
     """Where a trial is."""
 
     NEW = "new"
-    """Nothing has been asked of anybody."""
+    """No request has been sent yet."""
     HANDING_OFF = "handing_off"
     """A simulator rebuilds its start."""
     WAITING = "waiting"
@@ -287,7 +289,7 @@ class Trial:
         self._end(outcome, reason)
 
     def skip(self, *, success: bool = False, steps: int = 0) -> None:
-        """Ends it before it begins, without a row: an earlier run finished it, or nobody asked for it.
+        """Ends it before it begins, without a row: an earlier run finished it, or it was not requested.
 
         Args:
             success: how it ended then.

@@ -1,4 +1,4 @@
-"""Films of some trials, as many as asked for and no more; a trial nobody wants to see renders nothing."""
+"""Records videos of as many trials as requested; other trials render no frames."""
 
 from __future__ import annotations
 

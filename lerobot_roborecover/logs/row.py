@@ -69,7 +69,7 @@ class RunExtent:
 class TrialRow:
     """One finished trial. Flat, so that a log loads into any table library as it is.
 
-    Rows of one log share equal texts, `options` and `versions`; nobody changes these in place.
+    Rows of one log share equal texts, `options` and `versions`; never change these in place.
     """
 
     schema: int
@@ -215,7 +215,7 @@ def make_row(
         batch_size=batch_size,
         outcome=outcome.value,
         success=outcome is Outcome.SUCCESS,
-        # What broke a trial may have said anything, and must not make its row one that nobody can read.
+        # Sanitizes the error text so that the row stays readable.
         reason=reason[:MAX_TEXT].encode(errors="replace").decode(),
         steps=steps,
         horizon=scenario.task.horizon,

@@ -48,7 +48,7 @@ class ReadLog:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What whoever uses the rows has to know about the file."""
+        """Warnings for readers of this log."""
         if not self.cut:
             return ()
         return (f"{self.path}: its last line was cut off by a crash and is left out; rerun to complete",)

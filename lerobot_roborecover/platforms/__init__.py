@@ -98,7 +98,7 @@ def _load(name: str) -> Platform | None:
     try:
         found = entry.load()
         found = found() if isinstance(found, type) else found
-    except Exception as err:  # whatever somebody else's import raises
+    except Exception as err:  # a third-party import may raise anything
         raise ScenarioError(f"{of} cannot be loaded: {type(err).__name__}: {err}") from err
     if not isinstance(found, Platform) or found.name != name:
         what = f"is called {found.name!r}" if isinstance(found, Platform) else f"is a {type(found).__name__}"

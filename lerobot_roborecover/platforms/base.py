@@ -102,7 +102,7 @@ class Platform:
     clustered: ClassVar[bool] = False
     """Several scenarios come of one trajectory: statistics resample trajectories, not scenarios."""
     apart: ClassVar[tuple[str, ...]] = ("trajectory", "record")
-    """What may not lie on both sides of a split (`roborecover split`), where nobody says otherwise."""
+    """What may not lie on both sides of a split; default of `roborecover split`."""
     images_rotated_180: ClassVar[bool] = False
     """Observed pictures leave the simulator rotated by 180 degrees."""
     sizes_pictures: ClassVar[bool] = True
@@ -249,7 +249,7 @@ class Platform:
             )
 
     def rewind_steps(self, horizon: int) -> int:
-        """Steps that Reversion goes back where nobody says otherwise (paper, "Intervention Results").
+        """Returns the default number of steps that Reversion rolls back (paper, "Intervention Results").
 
         Args:
             horizon: S of the task.
@@ -377,8 +377,11 @@ class Platform:
         return observation
 
     def gripper_closed(self, state: np.ndarray) -> bool:
-        """Whether the gripper is to stay closed, by the (D,) `observation.state` of a policy: whoever takes
-        over must not drop what the policy holds."""
+        """Whether the gripper is to stay closed when a person takes over, so that the object is not dropped.
+
+        Args:
+            state: (D,) `observation.state` of a policy.
+        """
         return False
 
     def owns_observation(self, observation: Mapping[str, tuple[int, ...]]) -> bool:
@@ -393,7 +396,7 @@ class Platform:
         Raises:
             ScenarioError: it cannot be driven by hand; says why.
         """
-        raise ScenarioError(f"{self.title} cannot be driven by hand: nobody has said what the keys mean")
+        raise ScenarioError(f"{self.title} cannot be driven by hand: the platform does not define the keys")
 
     # --- LeRobot
 
@@ -459,7 +462,7 @@ def chosen_quality(quality: str) -> dict[str, str]:
 
 
 def no_video(_: Observation) -> np.ndarray:
-    """Frame of a video nobody asked for: grey, so that it is not mistaken for a dark scene."""
+    """Placeholder frame where no video is requested: grey, so that it is not mistaken for a dark scene."""
     return np.full((64, 64, 3), 128, np.uint8)
 
 

@@ -6,7 +6,7 @@ A simulator that knows its limits has three more methods, which change nothing i
 - `joint_margin_rad()`: how far the arm's joint nearest to a limit is from it;
 - `workspace()`: where hand and objects belong.
 
-One that does not know them lacks the methods, and whoever asks learns so from `limits_of`.
+A simulator that does not know its limits lacks these methods; `limits_of` returns None for it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tasks by name and pattern, and names that somebody may have meant."""
+"""Finds tasks by name and pattern, and suggests names for a misspelt one."""
 
 from __future__ import annotations
 

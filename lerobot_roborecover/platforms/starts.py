@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
 
 RELEASE_SEED = 7
-"""Of resets and draws where nobody says otherwise (the paper's release)."""
+"""Default seed of resets and draws (the paper's release)."""
 MAX_STARTS = 100_000
 
 

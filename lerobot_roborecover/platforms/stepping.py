@@ -1,11 +1,11 @@
-"""Steps a simulator through actions that are known: the one loop that does.
+"""Steps a simulator through known actions. All replays use this loop.
 
-    for step in walk(simulator, rollout):
+    for step in iter_steps(simulator, rollout):
         if step in wanted:
             seen.append(simulator.observe())
 
-Between two steps the simulator stands at the state after `step` actions, and whoever walks looks at what is
-wanted: observation, picture, poses, predicate, hash. What nobody looks at is not rendered.
+Between two steps the simulator is in the state after `step` actions. There the caller reads what it needs:
+observation, image, poses, predicate, hash. Nothing is rendered unless the caller asks for it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lerobot_roborecover.scenario import Rollout
 
 
 class Steppable(Protocol):
-    """A simulator, or what stands between one and whoever steps it."""
+    """A simulator, or a wrapper of a simulator."""
 
     def step(self, action: np.ndarray) -> None:
         """Advances one control step."""

@@ -1,13 +1,13 @@
-"""Any LeRobot policy behind one call: observations of whoever waits in, a chunk of actions for each out.
+"""Batched inference with any LeRobot policy: observations in, one action chunk per trial out.
 
-A policy whose `predict_action_chunk` depends on its argument alone is asked for all waiting slots at once,
+A policy whose `predict_action_chunk` depends on its argument alone infers for all waiting slots in one batch,
 and each slot executes its own chunk. Any other policy (observation queues, temporal ensembling, a KV cache)
-gets an instance per slot that shares its weights, and is asked slot by slot. Either way a slot's history is
-its own.
+gets one instance per slot, which shares the weights, and infers slot by slot. Either way every slot has its
+own history.
 
-A trial has a random stream of its own that starts from its seed, exactly as stock `lerobot-eval` seeds torch
-at batch 1. Where a policy takes its noise from outside, or is asked alone, the trial draws what it would draw
-there, whoever shares the batch; where a batched policy draws inside, the batch is seeded and the row says so.
+Every trial has its own random stream that starts from its seed, exactly as stock `lerobot-eval` seeds torch
+at batch size 1. Where a policy takes its noise as an argument, or infers slot by slot, a trial draws the same
+noise in any batch. Where a batched policy draws noise inside, the batch is seeded and the row says so.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Who is evaluated, and how much of it: what the trial rows say of a run beside its scenarios and its
-simulators. Read from a policy's parsed configuration, whoever parsed it.
+"""Reads a run's policy metadata from the parsed configuration: the policy's identity and settings.
+
+Trial rows record it beside the scenario and the simulator.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from lerobot_roborecover.policies.interventions.options import MEMBERS, POLICY_T
 
 @dataclass(frozen=True)
 class PolicyMetadata:
-    """Facts of a run; None where nobody says."""
+    """Policy metadata of a run; None where not given."""
 
     policy: str = "unknown"
     """Who is evaluated, in the rows' words."""

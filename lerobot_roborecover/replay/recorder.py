@@ -39,7 +39,7 @@ class Recorder:
     """Drives a simulator and records it; after T actions there are T + 1 states.
 
     Args:
-        simulator: of any platform; whoever else steps it says so with `note`.
+        simulator: of any platform; a caller that steps it directly reports the action with `note`.
     """
 
     def __init__(self, simulator: Simulator):

@@ -18,8 +18,8 @@ class SnapshotCache:
     Args:
         max_bytes: memory the snapshots may take.
         folder: where to keep them between runs; None keeps them in memory alone.
-        approximate: serve simulators whose snapshots are not exact as well: the state comes back, what
-            follows drifts from a replay. Nobody gets this without asking for it.
+        approximate: also serve simulators whose snapshots are not exact: the state is restored, but the
+            steps after it drift from a replay. Off by default.
     """
 
     def __init__(self, max_bytes: int = 64 * 2**20, folder: Path | None = None, *, approximate: bool = False):

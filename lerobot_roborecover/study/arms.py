@@ -89,7 +89,7 @@ def _arm(
         **{option: yaml.safe_load(text) for option, text in sorted(study.env.items())},
         "trial_log": folder / "trials.jsonl",
     }
-    # One observation a batch: an inference then rounds alike whoever else is waiting.
+    # One observation a batch: an inference then rounds alike, whichever other trials wait.
     runner = {"max_batch": 1, "portable": True, "slots": slots}
     run = RunSpec(study.platform, env, {**policy, "device": "cpu"}, trials, folder, runner=runner)
     return StudyArm(name, start, trials, run)

@@ -70,7 +70,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
     env = [part for name, value in recipe.env.items() for part in ("--env", f"{name}={value}")]
     logs = [str(trials / name / "trials.jsonl") for name in screening]
     base_trials = out / "base_trials"
-    # A base that had no say in screening has no trials yet.
+    # A base policy that was not used for screening has no trials yet.
     base_stage = StudyStage(
         "base trials",
         (trials_of(policy(recipe.base), recipe.policies[recipe.base], base_trials),),

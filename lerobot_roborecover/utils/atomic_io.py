@@ -1,9 +1,9 @@
-"""Files and folders that appear whole, on disk, or not at all.
+"""Writes files and folders atomically: they appear complete, on disk, or not at all.
 
-Each is written under a name of its own beside its place, `.NAME.PROCESS.tmp`. A process that is killed leaves
-that behind; whoever writes NAME next takes it away. That nobody is at work on a folder any more is known by a
-lock (`.NAME.PROCESS.lock`), which the system lets go of with the process, on whichever machine it ran. The
-lock file also names the machine and when the process began, for file systems without locks.
+Each is first written as `.NAME.PROCESS.tmp` beside its final place. A killed process leaves this behind; the
+next process that writes NAME removes it. A lock (`.NAME.PROCESS.lock`) shows that a process still writes a
+folder; the system releases the lock when the process ends, on any machine. For file systems without locks,
+the lock file also names the machine and the process's start time.
 """
 
 from __future__ import annotations

@@ -1,9 +1,12 @@
 """Append-only JSON-lines files whose records are on disk before anything else happens.
 
-`AppendOnly` is the file itself: one process at a time, lines that are on disk when `append` returns, a last
-line that a crash has cut off dropped on the next opening, every complete line kept. What a line holds is the
-business of whoever opens it: `Journal` (votes, decisions, rollouts: records with a schema version),
-`env.trial_log.TrialLog` (checked rows that stay on disk), `datasets.fingerprint` (replays by key).
+`AppendOnly` is the file itself. One process at a time holds it, and a line is on disk when `append` returns.
+The next opening drops a last line that a crash has cut off, and keeps every complete line. The lines' content
+is up to the caller:
+
+- `Journal`: votes, decisions, rollouts; records with a schema version.
+- the trial log: checked rows.
+- `datasets.fingerprint`: replays by key.
 """
 
 from __future__ import annotations
@@ -70,9 +73,9 @@ class AppendOnly:
         return complete_lines(self._file, longest)
 
     def cut(self) -> int:
-        """Drops a last line without its end, a crash's leftover; how many bytes that were.
+        """Drops an incomplete last line, left by a crash, and returns its number of bytes.
 
-        Whoever opens the file reads it first: one that holds something else is not to be cut.
+        The caller must read the file first: a file of another kind must not be cut.
         """
         number = self._file.fileno()
         size = end = os.fstat(number).st_size
@@ -147,7 +150,7 @@ def complete_lines(file: IO[bytes], longest: int | None = None) -> Iterator[byte
 
     Args:
         file: open for reading.
-        longest: bytes of a line; of a longer one so many are given, for whoever reads to refuse.
+        longest: bytes of a line at most; a longer line is yielded cut, for the reader to refuse.
     """
     file.seek(0)
     limit = -1 if longest is None else longest + 2
@@ -156,7 +159,7 @@ def complete_lines(file: IO[bytes], longest: int | None = None) -> Iterator[byte
 
 
 def append_records(path: Path, *records: Mapping[str, Any]) -> None:
-    """Adds plain records to a file that nobody keeps open; a crash's leftover at its end goes.
+    """Appends plain records to a file that no process keeps open; drops an incomplete last line.
 
     Raises:
         OSError: they could not be written; the file is as it was.

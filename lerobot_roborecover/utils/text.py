@@ -29,7 +29,7 @@ def next_command(argv: Sequence[str], what: str = "next") -> str:
     """The line that names the command to run after this one, as a shell takes it.
 
     Args:
-        argv: after `roborecover`; words in capitals are for whoever runs it to fill in.
+        argv: after `roborecover`; the user replaces words in capitals.
         what: the line's beginning.
     """
     return f"{what}: roborecover {shlex.join(argv)}"

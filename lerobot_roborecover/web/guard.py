@@ -32,7 +32,7 @@ _HEADERS = {
 
 
 class Refusal(Exception):
-    """A request is not answered; carries the status and one line for whoever sent it."""
+    """Refuses a request, with a status and a one-line message for the client."""
 
     def __init__(self, status: int, message: str):
         super().__init__(message)
@@ -43,15 +43,15 @@ def check_token(request: HTTPConnection, name: str, token: str | None, command: 
     """Refuses a request without the token, or from another page.
 
     Args:
-        request: or a websocket that is not accepted yet.
-        name: whose token, and whose cookie.
-        token: the right one; None where nobody has that name.
-        command: has printed the address.
+        request: the request, or a websocket that is not accepted yet.
+        name: the user's name, which has the token and the cookie.
+        token: the right token; None where no user has that name.
+        command: the command that has printed the address.
 
     Raises:
         Refusal: the token is missing or wrong, or a change does not come from the page itself.
     """
-    # A wrong name is answered like a wrong token: nobody learns here who else takes part.
+    # A wrong name is answered like a wrong token, so that a client cannot find out the users' names.
     cookie = request.cookies.get(cookie_name(name, token or ""), "")
     sent = (cookie, request.query_params.get("token", ""))
     if token is None or not any(hmac.compare_digest(s.encode(), token.encode()) for s in sent):

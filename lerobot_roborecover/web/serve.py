@@ -34,7 +34,7 @@ def listen(port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
-        # Whoever comes before the server is ready waits, instead of being turned away.
+        # A client that connects before the server is ready waits, instead of being refused.
         listener.listen(128)
     except (OSError, OverflowError) as err:
         listener.close()

@@ -24,7 +24,7 @@ def refuse_node(failure: SlotFailure | None, where: str) -> None:
 
 @dataclass(frozen=True)
 class WorkerStartup:
-    """What a slot on a cluster does on its node before anybody uses it, since nodes differ."""
+    """Setup of a cluster slot on its node before its first use, since nodes differ."""
 
     environment: Callable[[int], Mapping[str, str | None]] | None = None
     """Given the slot's number, environment variables of its process: where it draws. A module's function."""

@@ -1,8 +1,8 @@
-"""Slots on a Ray cluster: an actor each, with a worker process beside it on its node.
+"""Slots on a Ray cluster: each is an actor with a worker process on the same node.
 
-A simulator that crashes or hangs is therefore handled on its node as it is locally, and costs the item it was
-at. An actor that is gone means that its machine is: the item is lost, and whoever gave it gives it again, to
-another slot. Nothing that has finished depends on the cluster: what comes back is written here.
+A simulator that crashes or hangs is therefore handled on its node as it is locally, and costs only the item
+at hand. An actor that is gone means that its machine is gone: the item is lost, and the caller sends it to
+another slot. Finished results do not depend on the cluster: this process writes them.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def decisive_versions(platform: str) -> dict[str, str]:
 
 
 def _check_reachable(address: str) -> None:
-    """Raises an `OSError` where nobody answers at HOST:PORT, which Ray itself would try for minutes."""
+    """Raises an `OSError` where no server answers at HOST:PORT; Ray itself would retry for minutes."""
     host, _, port = address.rpartition(":")
     if "/" not in host and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S).close()

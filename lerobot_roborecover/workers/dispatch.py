@@ -34,10 +34,10 @@ def map_unordered[Item](
     *,
     fresh: bool = False,
 ) -> Iterator[tuple[Item, Any]]:
-    """Replies as they come, with what they are of; a `SlotFailure` where the simulator failed.
+    """Yields items with their replies in order of arrival; a `SlotFailure` where the simulator failed.
 
-    An item whose machine is lost is done again elsewhere, `MAX_ATTEMPTS` times in all. Whoever stops asking
-    ends what is under way.
+    An item whose machine is lost is done again elsewhere, `MAX_ATTEMPTS` times in all. Closing the iterator
+    ends the work under way.
 
     Args:
         slots: idle ones, all of one kind.

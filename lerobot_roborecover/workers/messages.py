@@ -81,8 +81,8 @@ class EpisodeSpec:
     rollback_steps: int = 0
     """How far back a rollback may be asked for: snapshots of as many steps are kept, where they are exact."""
     played: np.ndarray | None = None
-    """(n, A) actions that are executed after the handoff and before anybody looks, in their own type: what a
-    fork's parent did."""
+    """(n, A) actions of a fork's parent, in their own type: executed after the handoff and before the first
+    observation."""
     spent: int = 0
     """New steps that count as taken when the policy takes over."""
 
@@ -118,7 +118,7 @@ class ActResult:
     """Reply to `act`: several actions executed without looking in between."""
 
     observation: dict[str, Any] | None
-    """After the last action; None once the trial is over, because nobody looks at it."""
+    """After the last action; None once the trial is over, when it is not needed."""
     steps: int
     """Actions executed: all, or those up to success or the horizon."""
     success: bool

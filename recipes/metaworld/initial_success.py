@@ -1,4 +1,4 @@
-"""How often Meta-World policies solve tasks from their starts, before anybody asks how they recover.
+"""Measures how often Meta-World policies solve tasks from initial states, before recovery is measured.
 
 python -m recipes.metaworld.initial_success CHECKPOINT ... --trials 10
 """

@@ -3,8 +3,8 @@ the task all the same.
 
     python -m recipes.metaworld.scripted_operator --out OUT --tasks study --seeds 500-505
 
-Starts `roborecover teleop`'s server and talks to it over its websocket, as the page does. It stands in for a
-person where nobody can be asked, such as in the study that anyone re-runs; its recordings name it as driver.
+Starts `roborecover teleop`'s server and talks to it over its websocket, as the page does. It replaces a
+person where none is available, as in a rerun of the study; its recordings name it as driver.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def test_what_fails_twice_and_then_works_is_published(hub, client, local, method
     [
         (["POST", "/repos/create", 403, 9], ["403", "may not do this", "hf auth login"]),
         (["POST", "/repos/create", 401, 9], ["401", "HF_TOKEN"]),
-        (["POST", "/commit/", 409, 9], ["409", "somebody else"]),
+        (["POST", "/commit/", 409, 9], ["409", "another commit"]),
         (["POST", "/commit/", 413, 9], ["413", "refused"]),
         (["POST", "/tag/", 429, 99], ["429", "slow down"]),
         (["GET", "/refs", 500, 99], ["did not answer properly after 5 attempts"]),

@@ -274,7 +274,7 @@ def test_the_composite_policy_refuses_what_would_never_trigger(dataset, policy, 
     for monitor, message in (
         ("elapsed", "has no threshold, and would never trigger"),
         ("state_distance", "has not been fitted"),
-        ("oracle", "which nobody knows while a trial runs"),
+        ("oracle", "which is unknown while a trial runs"),
     ):
         assert main([*run, f"--policy.monitor.path={monitor}"]) == 2
         assert message in capsys.readouterr().err

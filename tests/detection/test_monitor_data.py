@@ -271,4 +271,4 @@ def test_the_command_runs_policies_once_and_goes_on_where_it_stopped(tmp_path, c
     with pytest.raises(ScenarioError, match="cannot be read"):
         policy_trials.read_trials(folder)
     assert main(argv[:-4]) == 2
-    assert "nobody continues the scenarios" in capsys.readouterr().err
+    assert "no policy continues the scenarios" in capsys.readouterr().err

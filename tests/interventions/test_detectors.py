@@ -334,7 +334,7 @@ def test_what_is_missing_is_said_before_anything_runs(probes):
     wanted = {STATE: PolicyFeature(FeatureType.STATE, (3,))}
     with pytest.raises(MonitorError, match=r"of shape \(3,\); the environment's is \(4,\)"):
         check_needs("x", DetectorNeeds(features=wanted), there, None)
-    with pytest.raises(MonitorError, match="needs to know the outcome, which nobody knows while a trial"):
+    with pytest.raises(MonitorError, match="needs to know the outcome, which is unknown while a trial"):
         check_needs("x", load("oracle").needs, there, None)
     check_needs("x", load("oracle").needs, there, None, ("outcome",))
     with pytest.raises(

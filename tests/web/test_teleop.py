@@ -483,7 +483,7 @@ def test_only_the_page_with_the_token_gets_in(address):
         ('{"type": "start", "task": 7}', "task must be text"),
         ('{"type": "mark", "stage": ["a"]}', "stage must be text"),
         ('{"type": "gripper"}', "no gripper"),
-        ('{"type": "hand_back"}', "nobody waits"),
+        ('{"type": "hand_back"}', "no trial waits"),
         ('{"type": "status", "id": "x"}', "id must be"),
     ],
 )
@@ -524,7 +524,7 @@ def test_a_simulator_that_breaks_ends_its_recording_and_not_the_server(tmp_path)
 
 def test_whoever_watches_does_not_drive(address):
     with Client(address) as first, Client(address) as second:
-        with pytest.raises(TeleopRefusal, match="somebody else drives"):
+        with pytest.raises(TeleopRefusal, match="another page drives"):
             first.act([0, 0])
         second.start("push-left", seed=1, discard=True)
         first.ask("drive")

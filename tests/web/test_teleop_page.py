@@ -119,11 +119,11 @@ def test_a_person_drives_marks_reloads_and_saves_and_a_killed_server_loses_nothi
         page.reload()
         page.wait_for_selector(f'body[data-step="{after - 10}"][data-mark="{taps}"][data-role="drive"]')
         assert "Contact · Wrong Pose" in page.inner_text("#marked")
-        # Somebody else takes the wheel; the page watches, and takes it back.
+        # Another page takes control; this page watches, and takes control back.
         with Client(address) as client:
             page.wait_for_selector('body[data-role="watch"]')
             page.keyboard.press("KeyM")
-            page.wait_for_selector("#message:has-text('somebody else drives')")
+            page.wait_for_selector("#message:has-text('another page drives')")
             client.look()
             push(client)
             page.wait_for_selector('body[data-solved="yes"]')
@@ -202,11 +202,11 @@ def test_a_second_page_watches_at_once_and_takes_the_wheel(visit, out):
         second, said = visit(address)
         second.wait_for_selector('body[data-role="watch"][data-under="way"]')
         second.wait_for_selector('#cameras canvas[data-step="0"]')
-        assert "somebody else drives" in second.inner_text("#advice")
+        assert "another page drives" in second.inner_text("#advice")
         second.keyboard.press("Enter")
-        second.wait_for_selector("#message:has-text('V takes the wheel')")
+        second.wait_for_selector("#message:has-text('V takes control')")
         first.close()
-        second.wait_for_selector("#advice:has-text('nobody drives')")
+        second.wait_for_selector("#advice:has-text('no page drives')")
         second.click("#wheel")
         second.wait_for_selector('body[data-role="drive"]')
         hold(second, "KeyA", 2)

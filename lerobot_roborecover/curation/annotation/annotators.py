@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 PREFIX = "auto-"
-"""Of every automatic annotator's name, and of nobody else's."""
+"""Prefix of every automatic annotator's name; no person's name begins with it."""
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,7 @@ class FramePacks:
         for number in range(-(-self._steps[episode] // PACK)):
             for camera in self.videos.cameras:
                 self._waiting.append(self._ahead.submit(self._quietly, camera, episode, number))
-        # Whoever leafs through the queue is not waited for: only the latest wishes stay.
+        # A user may leaf through the queue faster than packs are made: only the latest requests stay.
         while len(self._waiting) > MAX_AHEAD:
             self._waiting.popleft().cancel()
 
@@ -218,7 +218,7 @@ class FramePacks:
         self._ahead.shutdown(wait=False, cancel_futures=True)
 
     def _quietly(self, camera: str, episode: int, number: int) -> None:
-        # Whoever asks for it is told.
+        # The request that needs this pack raises the error again and reports it.
         with contextlib.suppress(ScenarioError):
             self.pack(camera, episode, number)
 

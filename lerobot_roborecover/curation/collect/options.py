@@ -43,7 +43,7 @@ class CollectOptions:
     expert: str = ""
     """Name of a scripted driver."""
     name: str = ""
-    """Recorded name of whoever drives; by default the checkpoint's identity, or the expert's name."""
+    """Recorded name of the driver; by default the checkpoint's identity, or the expert's name."""
     work: Path | None = None
     """Working folder; by default beside `out`. Another collection from the same rollouts shares it."""
     env: tuple[str, ...] = ()

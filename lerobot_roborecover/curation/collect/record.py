@@ -1,8 +1,8 @@
-"""What is recorded of a rollout, and the simulator that records it while somebody else drives.
+"""Records a rollout inside the simulator's process while a policy or an expert drives.
 
-The recorder stands between whoever drives and the simulator, in the simulator's own process, because that is
-where an action's perturbation can be tested for reach, step by step. The record travels to the parent with
-the reply that ends the rollout, and becomes a file there: the simulator may be on another machine.
+The recorder wraps the simulator in the simulator's own process, because only there can each perturbed action
+be tested for reach. The reply that ends the rollout carries the record to the parent process, which writes
+the file: the simulator may run on another machine.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Record:
     """(T, A) float64, as executed."""
     steps: Steps
     margin_rad: np.ndarray
-    """(T + 1,) float64: distance of the arm's joints from their limits; NaN where nobody knows."""
+    """(T + 1,) float64: distance of the arm's joints from their limits; NaN where unknown."""
     workspace: Workspace | None
     """Of the reset, where the simulator knows it."""
     solved_after: int | None = field(init=False)

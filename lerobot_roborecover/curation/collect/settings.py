@@ -19,7 +19,7 @@ SETTINGS_FILE = "collect.json"
 
 
 def driver_of(options: CollectOptions) -> str:
-    """Recorded name of whoever drives."""
+    """Returns the recorded name of the driver."""
     if options.name:
         return options.name
     if options.expert:

@@ -23,7 +23,7 @@ class RolloutSpec(TrialStart):
     """A rollout to be made, from a task's first state: its prefix is nothing but the settling actions."""
 
     driver: str
-    """Recorded name of whoever drives."""
+    """Recorded name of the driver."""
     trial: int
     """Of the rollouts from this start."""
     perturbed: bool
@@ -78,12 +78,12 @@ def parse_numbers(text: str, option: str) -> tuple[int, ...]:
 def make_units(
     tasks: Sequence[Task], starts: Starts, driver: str, settle_action: np.ndarray, *, perturbed: bool
 ) -> list[RolloutSpec]:
-    """One plan a rollout, task by task.
+    """Lists the rollouts to make, task by task.
 
     Args:
-        tasks: where to.
-        starts: from where.
-        driver: recorded name of whoever drives.
+        tasks: tasks to collect on.
+        starts: resets of each task.
+        driver: recorded name of the driver.
         settle_action: (A,) repeated while settling.
         perturbed: whether actions are perturbed.
 

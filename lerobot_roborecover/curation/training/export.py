@@ -5,7 +5,7 @@ as its log says is left out. Beside LeRobot's columns and ours (`datasets.trajec
 
     next.success, next.done            bool: the action solved the task; it is the episode's last
     next.reward                        float32: the step's share of the return (`returns`)
-    complementary_info.is_intervention bool: somebody other than the trial's policy chose the action
+    complementary_info.is_intervention bool: the action was not chosen by the trial's policy
     roborecover.progress               float32: of the task before the action; NaN where it is not told
     roborecover.return_to_go, .value, .advantage   float32 (`returns`)
 
@@ -47,7 +47,7 @@ class Exported:
     episodes: int
     frames: int
     interventions: int
-    """Frames that somebody else chose."""
+    """Frames whose action the trial's policy did not choose."""
     successes: int
     progress_known: bool
 

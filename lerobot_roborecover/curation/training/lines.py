@@ -20,7 +20,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 OTHERS = ("correction", "takeover")
-"""Interventions in which somebody else acts for some steps."""
+"""Interventions in which another policy or a person acts for some steps."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TrainingLine:
     first: int
     """Actions that are only replayed: the episode begins after them."""
     intervention: np.ndarray
-    """(n,) bool: somebody other than the policy of the trial chose the action."""
+    """(n,) bool: the action was not chosen by the trial's policy."""
     success: bool
     driver: str
     trial: int

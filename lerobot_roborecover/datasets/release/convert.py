@@ -149,7 +149,7 @@ def read_record(
         table: that has the row.
         row: says id, split and prefix.
         reading: what is taken.
-        remedy: what somebody who downloaded the file can do about a bad record.
+        remedy: what the user who downloaded the file can do about a bad record.
 
     Raises:
         ScenarioError: names the field, the value, and the remedy.

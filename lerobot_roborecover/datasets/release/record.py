@@ -76,7 +76,7 @@ def check_seed(seed: int | None, reading: Reading) -> None:
     """Checks that a LIBERO reset has the release's seed.
 
     Raises:
-        RequiresOptIn: it has another, and nobody asked for that.
+        RequiresOptIn: it has another seed, and `reading` does not allow that.
     """
     if seed != LIBERO_SEED and not reading.any_seed:
         raise RequiresOptIn(

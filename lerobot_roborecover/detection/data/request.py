@@ -70,7 +70,7 @@ def make_monitor_data(request: MonitorRequest, progress: Callable[[str, int, int
     """
     if not (request.policies or request.trials_from or request.rollouts):
         raise ScenarioError(
-            "nobody continues the scenarios: give --policy CHECKPOINT, --trials-from DIR or --rollouts DIR"
+            "no policy continues the scenarios: give --policy CHECKPOINT, --trials-from DIR or --rollouts DIR"
         )
     scenarios = load_scenarios(
         request.scenarios, revision=request.revision, split=request.split, select=request.select

@@ -1,1 +1,1 @@
-"""Forks: from a step of a logged trial, what would have come of it had somebody stepped in."""
+"""Forks: counterfactual rollouts that branch from a step of a logged trial, with and without intervention."""

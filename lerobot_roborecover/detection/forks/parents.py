@@ -68,8 +68,8 @@ def rows_of(logs: Sequence[Path], policy: str) -> list[tuple[Path, TrialRow]]:
     if not mine:
         raise ScenarioError(
             f"no trial in {', '.join(map(str, logs))} is by {policy}; there are trials by "
-            f"{sorted({row.policy for _, row in found}) or 'nobody'}. Name the checkpoint that ran them with "
-            "--policy"
+            f"{sorted({row.policy for _, row in found}) or 'no policy'}. Name the checkpoint that ran them "
+            "with --policy"
         )
     return mine
 

@@ -72,7 +72,7 @@ def default_base(env_type: str) -> EnvConfig:
     """
     try:
         return BaseEnvConfig.get_choice_class(env_type)()
-    except Exception as err:  # whatever somebody else's configuration asks for
+    except Exception as err:  # a third-party configuration may raise anything
         raise OptionError(f"--env.base.type={env_type}: {type(err).__name__}: {err!s:.300}") from err
 
 

@@ -30,7 +30,7 @@ class EnvFacts:
     action_names: tuple[str, ...]
     """What each value of an action is."""
     kwargs: Mapping[str, Any]
-    """Of the env where nothing is drawn and nobody asks for pictures."""
+    """Arguments of the env where it renders nothing and no images are requested."""
     state_width: int
     """Values of `agent_pos`."""
     environment_width: int = 0

@@ -1,6 +1,7 @@
-"""Environments draw their pictures in every step, also where nobody looks: PushT and Aloha need not.
+"""Skips rendering in PushT and Aloha, which otherwise render in every step.
 
-While `Unseen` is entered, drawing is left out; `complete` draws what a policy sees, of the present state.
+Inside the context manager `Unseen` nothing is rendered. `complete` renders the policy's images of the current
+state.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from lerobot_roborecover.platforms.simulator import Observation
 
 
 class Unseen:
-    """Leaves nothing out: of environments that nobody knows, every step's observation is kept as it is."""
+    """Base class for unknown environments: skips no rendering, keeps every step's observation unchanged."""
 
     def __enter__(self) -> None: ...
 

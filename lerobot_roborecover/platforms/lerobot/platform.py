@@ -51,7 +51,7 @@ class LeRobotPlatform(Platform):
         return Task(self.name, self.env_type, name, instruction or name, self.facts.horizon)
 
     def task(self, name: str, instruction: str = "", suite: str = "") -> Task:
-        """By name, also of a type whose tasks nobody lists."""
+        """Returns a task by name, also of an env type whose tasks are not listed."""
         if self.env_type in KNOWN:
             return super().task(name, instruction, suite)
         return self._task(name, instruction)
@@ -193,7 +193,7 @@ def member(name: str) -> LeRobotPlatform:
         "perturbation": known.perturbation if known else (),
         "perturbable": bool(known and known.perturbation),
         "why_not_perturbable": (
-            f"nobody has said how far an action of env type {kind} may be disturbed in its own units"
+            f"no perturbation range is known for actions of env type {kind}, which have their own units"
         ),
     }
     return type("LeRobotMember", (LeRobotPlatform,), members)()

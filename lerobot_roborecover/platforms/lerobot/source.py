@@ -73,7 +73,7 @@ def make_env(source: EnvSource, task: str) -> gym.Env:
         env = (_registered if source.package else _of_lerobot)(source, task)
     except SimulatorError:
         raise
-    except Exception as err:  # whatever somebody else's environment raises
+    except Exception as err:  # a third-party environment may raise anything
         raise SimulatorError(
             f"task {task!r:.120} cannot be made: {type(err).__name__}: {err!s:.400}"
         ) from err

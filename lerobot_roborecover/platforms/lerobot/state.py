@@ -1,7 +1,7 @@
-"""What of somebody else's environment is its complete state, and where its bodies are.
+"""Finds the complete state of a third-party environment, and its bodies' poses.
 
-Four kinds, the first that fits: MuJoCo's integration state (also behind dm_control), the bodies of a pymunk
-space, a `get_state`/`set_state` pair, and the observation.
+The first kind that fits is used: MuJoCo's integration state (also behind dm_control), the bodies of a pymunk
+space, a `get_state`/`set_state` pair, or the observation.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def light_copy(model: mujoco.MjModel, pixels: int, cache: Path) -> mujoco.MjMode
     """
     drawn = copy.copy(model)
     drawn.vis.quality.offsamples = drawn.vis.quality.shadowsize = 0
-    drawn.mesh_graphadr[:] = -1  # convex hulls, which nobody looks at
+    drawn.mesh_graphadr[:] = -1  # convex hulls, which are not rendered
     most = max(_FEWEST_FACES, _FACES_PER_PIXEL * pixels)
     seen = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & (model.geom_group != _COLLISION_GROUP)
     for mesh in np.unique(model.geom_dataid[seen]):

@@ -1,6 +1,6 @@
-"""Points of a Meta-World task that matter to whoever looks at a rollout: what is to be handled, and where to.
+"""Points of a Meta-World task that a reviewer of a rollout needs: the handled object and its goal.
 
-A body's centre of mass says neither: that of the basketball lies 0.6 m from the ball, and a goal is no body.
+A body's centre of mass shows neither: the basketball's lies 0.6 m from the ball, and a goal is not a body.
 """
 
 from __future__ import annotations

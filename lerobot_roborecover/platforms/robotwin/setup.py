@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sapien import Entity
 
 type TaskCode = Any
-"""A task of RoboTwin's own code, which has no types and is in nobody's environment."""
+"""A task of RoboTwin's own code, which has no types and is not installed as a package."""
 
 _ARMS = "left_entity", "right_entity"
 

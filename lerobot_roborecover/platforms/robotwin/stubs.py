@@ -6,7 +6,7 @@
 - `curobo` plans collision-free motions on a GPU, for end-effector actions and for the scripted expert
   `play_once`. Where it is installed the real one is used; where not, its planner can be made and asked to
   move a gripper, which is arithmetic, and nothing else.
-- `open3d` writes point clouds, which nobody asks for here. The real one is used where it is installed.
+- `open3d` writes point clouds, which are not used here. The real one is used where it is installed.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ What that code does that an evaluation has to know (RoboTwin 2.0):
   Replayed actions do not count in a trial, so the limit is taken away; the caller counts.
 - `take_action` asks the predicate after every physics substep, stops in mid-action when it holds, and does
   nothing from then on.
-- It updates the renderer's copy of the scene after every substep, and renders on success. Both are left out
-  while acting, and made up for when somebody looks.
+- It updates the renderer's copy of the scene after every substep, and renders on success. Both are skipped
+  while acting, and done when an image is requested.
 - `check_success` of three tasks reads what only the scripted expert sets; see `setup.mend`.
 - `envs` must be imported, and scenes built, with the checkout as working directory.
 """

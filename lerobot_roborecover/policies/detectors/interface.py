@@ -1,15 +1,15 @@
-"""What is asked of a detector, whatever is inside it: a window of what a trial has shown, in; a score, out.
+"""Interface of failure detectors: a window of a trial's steps in, a score out.
 
-Contract with whoever implements one:
+Contract for implementations:
 
-- A detector is stateless: what it says of a window depends on that window alone. So trials may share a batch,
-  be resumed, and be interleaved in any order; whoever asks keeps the history.
-- It says beforehand what it needs (`DetectorNeeds`): observation keys, how far back it looks, action chunks
-  of the policy that acts, the policy's own features, or a truth that nobody knows while a trial runs.
-- A higher score means "needs help" more. A score of NaN says nothing, and never triggers.
+- A detector is stateless: its score of a window depends on that window alone. So trials may share a batch, be
+  resumed, and be interleaved in any order. The caller keeps the history.
+- It declares what it needs (`DetectorNeeds`): observation keys, the length of the window, action chunks of
+  the acting policy, the policy's features, or a ground truth that is unknown while a trial runs.
+- A higher score means that failure is more likely. A score of NaN means no answer, and never triggers.
 
-A recovery monitor (`monitor_interface.Monitor`), which judges one observation at a time, is a detector
-through `MonitorDetector`.
+`MonitorDetector` turns a recovery monitor (`monitor_interface.Monitor`), which scores one observation at a
+time, into a detector.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ SEEN = "roborecover.seen"
 SEED = "roborecover.seed"
 """Batch key: (B,) int64, the trial's."""
 DEVIATED = "roborecover.deviated"
-"""Batch key: (B,) float32, 1 from the recovery point on; NaN where nobody knows."""
+"""Batch key: (B,) float32, 1 from the recovery point on; NaN where unknown."""
 WILL_FAIL = "roborecover.helpless"
-"""Batch key: (B,) float32, 1 where the policy does not recover by itself; NaN where nobody knows."""
+"""Batch key: (B,) float32, 1 where the policy does not recover by itself; NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,9 @@ class DetectorWindow:
     seed: int = 0
     """The trial's."""
     deviated: float = math.nan
-    """1 from the recovery point on, 0 before it; NaN where nobody knows."""
+    """1 from the recovery point on, 0 before it; NaN where unknown."""
     helpless: float = math.nan
-    """1 where the policy does not recover by itself, 0 where it does; NaN where nobody knows."""
+    """1 where the policy does not recover by itself, 0 where it does; NaN where unknown."""
 
 
 @runtime_checkable

@@ -103,10 +103,10 @@ def check_needs(
 
     Args:
         name: what the user calls it.
-        needs: the detector's.
-        features: what the environment gives, by LeRobot key.
-        probe: into the policy that acts; None where that cannot be looked into.
-        truths: that whoever asks knows.
+        needs: what the detector needs.
+        features: the environment's observations, by LeRobot key.
+        probe: reads the acting policy's internals; None where they cannot be read.
+        truths: ground truths that the caller knows.
 
     Raises:
         MonitorError: naming what is missing, what there is, and the remedy.
@@ -130,7 +130,7 @@ def check_needs(
             )
     if needs.truth and needs.truth not in truths:
         raise MonitorError(
-            f"{name} needs to know the {needs.truth.replace('_', ' ')}, which nobody knows while a trial "
+            f"{name} needs to know the {needs.truth.replace('_', ' ')}, which is unknown while a trial "
             "runs; it can be measured (`roborecover eval-monitor --detector oracle`), not used"
         )
     if needs.of_policy:

@@ -197,12 +197,11 @@ class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
     least_threshold = 0.0
 
     def fit(self, features: Tensor, gains: Tensor) -> float:
-        """Trains it: a state between gain and harm counts as the mean of what came of it, so that its output
-        is an expected gain.
+        """Trains the model to predict the expected gain: a state with gain and harm has their mean as target.
 
         Args:
             features: (N, F) where trials were forked.
-            gains: (N,) success when somebody steps in, less success when the policy goes on.
+            gains: (N,) success with an intervention, less success when the policy goes on.
 
         Returns:
             The last hundred steps' mean loss.

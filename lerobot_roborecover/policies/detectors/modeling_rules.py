@@ -98,5 +98,5 @@ class RoboRecoverOracleRewardModel(DetectorRewardModel):
         return DetectorNeeds(truth=self.config.truth)
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
-        """(B,) 0 or 1; NaN where nobody knows."""
+        """(B,) 0 or 1; NaN where unknown."""
         return batch[DEVIATED if self.config.truth == "recovery_point" else WILL_FAIL]

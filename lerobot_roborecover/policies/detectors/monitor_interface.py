@@ -1,12 +1,12 @@
-"""What the composite policy asks of a recovery monitor, whatever is inside it.
+"""Interface of recovery monitors, as the composite policy uses them.
 
-Contract with whoever implements one:
+Contract for implementations:
 
 - `monitor_loading.load_monitor(path, device)` returns an object of the protocol below from a folder or Hub
-  id, by LeRobot's own reward-model loaders and with the processors saved beside it.
-- A monitor is stateless: what it says of an observation depends on that observation (and instruction) alone,
-  so that trials may share a batch, be resumed, and be interleaved in any order.
-- It is asked at every environment step after the handoff, the handoff's own observation included, until its
+  id. It uses LeRobot's own reward-model loaders and the processors saved beside the model.
+- A monitor is stateless: its score of an observation depends on that observation (and instruction) alone, so
+  that trials may share a batch, be resumed, and be interleaved in any order.
+- It is called at every environment step after the handoff, the handoff's own observation included, until its
   first trigger in the trial; never on replayed actions (paper, "Monitor Training and Triggering").
 - An answer that cannot be read is a NaN score and never a trigger; the trial row counts it.
 """

@@ -1,16 +1,16 @@
-"""Decides, slot by slot and step by step, who acts: the one implementation under both runners.
+"""Chooses the controller of every slot at every step; both evaluation loops use this implementation.
 
-For each slot that wants an action:
+For each slot that needs an action:
 
-1. where an intervention is still to come, the monitor judges the observation (or, without one, it comes at
-   once); at most one intervention a trial;
-2. `reversion` asks the environment to go back, and the base policy goes on from there with fresh history;
-   `correction` and `human` take over with fresh history, for some steps or until the driver is done;
-3. whoever is in charge is asked for a chunk where the slot's queue is empty, all slots of one policy in one
-   batch;
-4. while a monitor is to see every step, one action leaves the queue at a time; otherwise all of them.
+1. Until the trial's intervention, the monitor scores the observation; without a monitor the intervention
+   comes at once. A trial has at most one intervention.
+2. `reversion` requests a rollback, after which the base policy continues with fresh history. `correction` and
+   `human` take over with fresh history, for some steps or until the person hands back.
+3. Where the slot's queue is empty, its controller infers an action chunk. All slots of one policy share a
+   batch.
+4. While the monitor must see every step, one action leaves the queue at a time; otherwise all of them.
 
-Nothing that happens in one slot touches another's queue, history or random stream.
+The slots' queues, histories and random streams are independent of each other.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class InterventionController:
         episode.history = None
 
     def _hand_over(self, episode: InterventionState, controller: Controller) -> None:
-        """Fresh history and an empty queue for whoever takes over; the trial's random stream goes on."""
+        """Gives the new controller fresh history and an empty queue; the trial's random stream goes on."""
         self._leave(episode)
         episode.controller, episode.queue = controller, None
         if controller in self.members:

@@ -43,7 +43,7 @@ class RemoteConfig(NotTrained, PreTrainedConfig):
     reconnect_s: float = 60.0
     """For a lost server to come back; then the trials that wait for it are begun again."""
     give_up_after: int = 3
-    """Times in a row that nobody answered after which the run stops; 0 never stops."""
+    """Consecutive outages of the server after which the run stops; 0 never stops."""
     max_frame_mb: int = 64
     """Of an answer."""
 

@@ -169,8 +169,8 @@ class Connection:
         """Connects, trying for a while, and reads the metadata.
 
         Raises:
-            ServerUnavailableError: nobody answered in time.
-            RemoteError: whoever answered is no policy server.
+            ServerUnavailableError: no server answered in time.
+            RemoteError: the server that answered is no policy server.
         """
         options, began, delay_s = self._options, time.monotonic(), _FIRST_DELAY_S
         headers = {"Authorization": f"Api-Key {options.api_key}"} if options.api_key else None
@@ -280,7 +280,7 @@ class RemoteServer:
             raise
 
     def tell(self, request: Request) -> None:
-        """Sends a request whose answer nobody waits for."""
+        """Sends a request without waiting for its answer."""
         if not self._closing.is_set():
             self._submit(request)
 

@@ -31,7 +31,7 @@ class WireError(RemoteError):
 
 
 class ServerUnavailableError(RemoteError):
-    """Nobody answers: no connection, a lost one, or silence."""
+    """The server does not answer: no connection, a lost one, or a timeout."""
 
 
 class SessionExpiredError(RemoteError):

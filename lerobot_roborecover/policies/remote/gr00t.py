@@ -156,7 +156,7 @@ class CallConnection(Connection):
         """The actions of an observation: a map of (1, n, A_i) arrays, or (n, A_i).
 
         Raises:
-            ServerUnavailableError: nobody answers, or the connection is lost again and again.
+            ServerUnavailableError: the server does not answer, or the connection is lost repeatedly.
             ServerRefusedError: the server reports an error.
             WireError: the answer is no message of the protocol.
         """
@@ -180,13 +180,13 @@ class CallConnection(Connection):
         raise AssertionError("unreachable")
 
     def reach(self, budget_s: float) -> None:
-        """Connects, and has a ping answered.
+        """Connects, and waits for the answer to a ping.
 
-        A server that infers for another client answers later: its queue is one.
+        A server that infers for another client answers later: all clients share one queue.
 
         Raises:
-            ServerUnavailableError: nobody answered in time.
-            RemoteError: whoever answered wants another token, or is no such server.
+            ServerUnavailableError: no server answered in time.
+            RemoteError: the server that answered wants another token, or is no GR00T server.
         """
         self.close()
         options = self._options

@@ -245,7 +245,7 @@ class RemotePolicy(PreTrainedPolicy):
 
         Raises:
             MappingError: the observations do not fit the mapping, or the server.
-            ServerUnavailableError: nobody has answered `give_up_after` times in a row.
+            ServerUnavailableError: the server has not answered `give_up_after` times in a row.
         """
         return self._answers(tasks, slots, observations, range(len(slots)))
 
@@ -303,7 +303,7 @@ class RemotePolicy(PreTrainedPolicy):
         if limit and self._outages >= limit:
             self.server.close()
             raise ServerUnavailableError(
-                f"{away[-1]}. Nobody answered {limit} times in a row (--policy.give_up_after), so the run "
+                f"{away[-1]}. No answer {limit} times in a row (--policy.give_up_after), so the run "
                 "stops here; once the server is back, the same command goes on"
             )
 

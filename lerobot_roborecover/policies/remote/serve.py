@@ -93,7 +93,7 @@ class ServeConfig:
             check_key(key)
         if key is None and not is_loopback(self.host) and not self.insecure:
             raise OptionError(
-                f"--host={self.host}: whoever reaches this address could use the policy. Set {API_KEY} here "
+                f"--host={self.host}: any client that reaches it could use the policy. Set {API_KEY} here "
                 "and at the client; or listen on 127.0.0.1 and use an SSH tunnel; or say --insecure=true"
             )
         return self.policy

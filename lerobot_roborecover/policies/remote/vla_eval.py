@@ -121,7 +121,7 @@ class EpisodeConnection(Connection):
 
         Raises:
             SessionExpiredError: the connection was lost after the episode's first observation.
-            ServerUnavailableError: nobody answers.
+            ServerUnavailableError: the server does not answer.
             ServerRefusedError: the server reports an error.
             WireError: the answer is no message of the protocol, or no actions.
         """
@@ -144,7 +144,7 @@ class EpisodeConnection(Connection):
         return {"actions": np.stack(rows)}
 
     def end(self) -> None:
-        """Ends the episode; nobody waits for an answer."""
+        """Ends the episode without waiting for an answer."""
         if self._socket is not None:
             try:
                 self._socket.send(pack_message("episode_end", {}, next(self._numbers)))

@@ -279,7 +279,7 @@ def make_app(study: AnnotationStudy) -> Starlette:
         return JSONResponse({"error": err.message}, err.status)
 
     async def unusable(request: Request, err: Exception) -> Response:
-        # The message names files and candidates, which is for whoever runs the server.
+        # The message names files and candidates, so it goes to the server's terminal only.
         episode = request.path_params.get("episode", "")
         candidate = study.names.candidates.get(episode, "")
         print(f"episode {episode} ({candidate}): {err}" if candidate else str(err), file=sys.stderr)

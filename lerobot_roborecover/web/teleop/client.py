@@ -31,11 +31,11 @@ class Client:
 
     Args:
         address: as `roborecover teleop` prints it, with the token.
-        pictures: receive pictures too (`frames`); without them nothing is rendered for this client.
+        pictures: receive images too (`frames`); without them nothing is rendered for this client.
         timeout_s: how long one answer may take; a task's first start compiles it.
 
     Raises:
-        ScenarioError: nobody listens there, or the address or its token is not right.
+        ScenarioError: no server listens there, or the address or its token is not right.
     """
 
     def __init__(self, address: str, *, pictures: bool = False, timeout_s: float = 300.0):

@@ -1,8 +1,7 @@
-"""Whoever looks at a simulator: one drives, the others watch. The bridge between its thread and the
-server's.
+"""Connects the viewers of a simulator to its thread: one viewer drives, the others watch.
 
-A viewer gets a new set of pictures only once it has shown the last, so that nothing piles up in a slow
-tunnel; and only the latest status.
+A viewer gets new images only once it has shown the last ones, so that no images queue up in a slow tunnel. It
+gets only the latest status.
 """
 
 from __future__ import annotations
@@ -70,15 +69,19 @@ class Hub:
         self._call(self._take_frames, step, dict(frames), taken, scene)
 
     def wants_pictures(self) -> bool:
-        """Whether somebody waits for pictures."""
+        """Whether a viewer waits for images."""
         return self._wanted.is_set()
 
     def watched(self) -> bool:
-        """Whether anybody looks at pictures at all."""
+        """Whether any viewer receives images."""
         return any(v.pictures for v in list(self.viewers))
 
     def unseen(self, taken: int) -> int:
-        """Of so many steps over the session, those that whoever drives has not seen yet; 0 without eyes."""
+        """Returns how many steps the driver has not seen yet; 0 for a driver that receives no images.
+
+        Args:
+            taken: steps over the whole session.
+        """
         driver = self.driver
         if driver is None or not driver.pictures or driver.shown_at is None:
             return 0
@@ -97,7 +100,7 @@ class Hub:
     # --- the server's
 
     def join(self, pictures: bool) -> Viewer | None:
-        """A new viewer; it drives if nobody does. None where there are too many."""
+        """Adds a viewer, which drives if there is no driver. None where there are too many viewers."""
         self._loop = asyncio.get_running_loop()
         if len(self.viewers) >= MAX_VIEWERS:
             return None
@@ -118,7 +121,7 @@ class Hub:
             self._everybody()
 
     def drive(self, viewer: Viewer) -> None:
-        """Gives the wheel to a viewer."""
+        """Makes a viewer the driver."""
         self.driver = viewer
         self._everybody()
 

@@ -1,8 +1,8 @@
-"""From held keys, sticks and buttons to control steps, on the simulator's side.
+"""Turns held keys, sticks and buttons into control steps, on the simulator's side.
 
-Whoever holds something says so again and again; what has not been said for `HOLD_S` is let go, so that a lost
-connection stops the robot. Time stands still while nothing is held, unless real time is asked for: people
-pause to think, and a recording should not.
+The page repeats every held input. An input that is not repeated for `HOLD_S` is released, so that a lost
+connection stops the robot. Without a held input the simulation pauses, unless real time is switched on: the
+recording then does not contain the operator's pauses.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ COMMANDS = (
     "start", "preview", "act", "back", "mark", "relabel", "unmark", "finish", "discard", "gripper",
     "realtime", "status", "hand_back",
 )  # fmt: skip
-"""Each is answered, and only taken from whoever drives."""
+"""Commands; each is answered, and only accepted from the driver."""
 _HEADER = struct.Struct("<BxxxI")
 
 

@@ -124,7 +124,7 @@ class _Connection:
                 self._hub.drive(viewer)
                 self._reply(viewer, identity, {"ok": True})
             elif self._hub.driver is not viewer:
-                raise ScenarioError("somebody else drives, and this page watches; take the wheel first")
+                raise ScenarioError("another page drives, and this page watches; take control first")
             elif kind == "hold":
                 device = "gamepad" if sent.get("device") == "gamepad" else "keyboard"
                 self._pilot.hold(device, held_axes(dict(sent)), bool(sent.get("wait")))

@@ -49,7 +49,7 @@ class TeleopSession:
     """Drives one simulator from a start.
 
     Args:
-        simulator: owned by whoever calls; used from one thread.
+        simulator: owned by the caller; used from one thread.
         operator: who drives; becomes the recording's driver.
     """
 

@@ -1,7 +1,7 @@
-"""The thread that owns the simulator: takes commands and held inputs in turn, steps, and shows what it sees.
+"""The thread that owns the simulator: processes commands and held inputs, steps, and renders images.
 
-Nobody drives blind: where pictures are slow, whether to make or to send, the robot waits for them, and moves
-no further between two of them than it would in real time. Pictures are made only when somebody waits for one.
+Where images are slow to render or to send, the robot waits for them: between two images it moves no further
+than in real time. Images are rendered only when a viewer waits for one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SimulatorThread(threading.Thread):
         operator: who drives.
         starts: where to begin, in order.
         store: takes what is saved.
-        hub: whoever looks on.
+        hub: the viewers.
         rate_hz: control steps a second, at most; None for the simulator's own.
         fps: pictures a second, at most.
     """
@@ -83,7 +83,7 @@ class SimulatorThread(threading.Thread):
         self._next = next_open(starts, map(read_recording, store.paths()))
         """Of the start that comes next."""
         self._previewing = False
-        """The start is loaded and shown, and nobody has begun yet."""
+        """The start is loaded and shown, and driving has not begun yet."""
         self._unloadable: int | None = None
         """The start that could not be shown; it is not tried again by itself."""
         self._loading: dict[str, Any] | None = None
@@ -100,7 +100,7 @@ class SimulatorThread(threading.Thread):
         try:
             simulator = self._make()
             self._session = TeleopSession(simulator, self._operator)
-        except Exception as err:  # whatever a simulator's import or driver raises is told to whoever waits
+        except Exception as err:  # an import or driver may raise anything; the main thread reports it
             self.error = err
             self.ready.set()
             return
@@ -154,7 +154,7 @@ class SimulatorThread(threading.Thread):
         return _IDLE_S
 
     def _owes_preview(self) -> bool:
-        """Whether somebody looks on, and there is a start to show."""
+        """Whether a viewer receives images and there is a start to show."""
         idle = self._session.start_point is None and self._next is not None
         return idle and self._next != self._unloadable and self._hub.watched()
 
@@ -344,7 +344,7 @@ class SimulatorThread(threading.Thread):
             self._end()
 
     def _do_hand_back(self, _sent: dict[str, Any]) -> None:
-        raise ScenarioError("nobody waits for this simulator; finish or discard the recording")
+        raise ScenarioError("no trial waits for this simulator; finish or discard the recording")
 
     def _end(self) -> None:
         """Nothing is under way any more; a start that was discarded comes next once more."""

@@ -100,7 +100,7 @@ class Takeover:
                 self._hub.show(slot.step, _pictures(observation), self._taken)
                 shown = True
             # A page that was opened just now asks for what is shown already.
-            # Nobody drives blind: what was not seen yet is waited for.
+            # The robot waits until the operator has seen the latest images.
             paused = self._hub.unseen(self._taken) >= most_unseen(self._pilot.rate_hz, FPS)
             event = self._pilot.poll(0.2 if shown and not paused else 0.02, paused=paused)
             if isinstance(event, Tick):
@@ -123,7 +123,7 @@ class Takeover:
             if isinstance(early, OperatorCommand):
                 early.reply({"ok": False, "message": "there was nothing to drive yet"})
         self._pilot.let_go()
-        # Whoever takes over must not drop what the policy holds.
+        # A takeover must not drop the object that the policy holds.
         self._pilot.closed = platform.gripper_closed(observation[_STATE].detach().cpu().numpy())
 
     def _answer(self, command: OperatorCommand) -> bool:

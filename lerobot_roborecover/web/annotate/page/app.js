@@ -223,7 +223,7 @@ async function open(id) {
   }
   if (mine !== opening) return;
   say("");
-  // Whoever has voted with a button goes on with the keys.
+  // After a vote with a button the keys work again: the button loses the focus.
   if (document.activeElement?.closest("main")) document.activeElement.blur();
   // The server may not have a vote yet that is still on its way to it.
   info.vote = session.queue[place(id)].vote;

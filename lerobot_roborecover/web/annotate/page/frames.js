@@ -15,7 +15,7 @@ export class Frames {
     this.stopped = new AbortController();
   }
 
-  // Fetches everything, nearest to a step first. Errors are left to whoever shows a frame.
+  // Fetches all packs, nearest to a step first. Errors are reported where a frame is shown.
   async load(around = 0) {
     const middle = Math.floor(around / this.size);
     const numbers = [...Array(this.count).keys()].sort((a, b) => Math.abs(a - middle) - Math.abs(b - middle));

@@ -122,7 +122,7 @@ function press(code, shift) {
   if (takeover && !IN_TAKEOVERS.includes(code)) return;
   if (!NEEDS_NOTHING.includes(code) && !code.startsWith("Digit")) {
     if (takeover && !status.under_way) return say("no policy has handed over yet");
-    if (!drives() && status.role) return say(`${status.driven ? "somebody else drives" : "nobody drives"}, and this page watches; V takes the wheel`);
+    if (!drives() && status.role) return say(`${status.driven ? "another page drives" : "no page drives"}, and this page watches; V takes control`);
     if (status.phase === "loading") return say("still loading; one moment");
     if (asked && code === "Enter") return;  // the press before is not answered yet
   }
@@ -145,7 +145,7 @@ function setSpeed(index) {
 
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  // A button that somebody has gone to with Tab is pressed with Enter and Space, as everywhere.
+  // A button that has the focus (Tab) is pressed with Enter and Space, as usual.
   const onButton = event.target instanceof HTMLButtonElement && ["Enter", "Space"].includes(event.code);
   if (onButton && !event.repeat) return;
   if (!isMotion(event.code) && !(event.code in ACTIONS)) return;

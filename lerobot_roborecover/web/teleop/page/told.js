@@ -92,7 +92,7 @@ function nothingUnderWay(message) {
 function advice(message) {
   const { phase, mark, horizon } = message;
   if (message.role === "watch") {
-    return message.driven ? "This page watches; somebody else drives." : "This page watches; nobody drives.";
+    return message.driven ? "This page watches; another page drives." : "This page watches; no page drives.";
   }
   if (message.mode === "takeover") return message.under_way ? "Drive, and hand back with H." : "";
   if (phase === "loading") return "Loading…";
