@@ -16,11 +16,11 @@ DATA_LIMIT_BYTES = 25_000_000
 
 def version() -> str:
     """The package's version, from its one place."""
-    tree = ast.parse((ROOT / PACKAGE / "__init__.py").read_text("utf-8"))
+    tree = ast.parse((ROOT / PACKAGE / "_version.py").read_text("utf-8"))
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__version__":
             return ast.literal_eval(node.value)
-    sys.exit(f"{PACKAGE}/__init__.py has no __version__")
+    sys.exit(f"{PACKAGE}/_version.py has no __version__")
 
 
 def check(out: Path) -> list[str]:

@@ -39,7 +39,7 @@ import sys
 from pathlib import Path
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.logs.trial_log import TrialLog
-from lerobot_roborecover.logs.row import Protocol, make_row
+from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.scenario import Outcome
 
 fail_after = int(sys.argv[1])
@@ -52,7 +52,7 @@ start = given["env.start"]
 (out / "environment").write_text(repr(dict(os.environ)))
 log = TrialLog(Path(given["env.trial_log"]))
 policy = given["policy.path"]
-protocol = Protocol(start=start, rewind_steps=0, policy=policy, run_seed=1000, execution_horizon=2)
+protocol = EvalProtocol(start=start, rewind_steps=0, policy=policy, run_seed=1000, execution_horizon=2)
 written = 0
 for index, scenario in enumerate(load_scenarios(given["env.scenarios"], select=given["env.select"])):
     for trial in range(int(given["eval.n_episodes"])):

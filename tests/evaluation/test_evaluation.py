@@ -138,7 +138,7 @@ def test_the_example_runs_without_an_account(capsys):
 
 def test_trackers_take_the_call():
     wandb = pytest.importorskip("wandb", reason="the call's signature is compared with wandb's")
-    inspect.signature(wandb.sdk.wandb_run.EvalSession.log).bind(None, {"recovery/success": 0.5}, step=10)
+    inspect.signature(wandb.sdk.wandb_run.Run.log).bind(None, {"recovery/success": 0.5}, step=10)
 
 
 @pytest.mark.parametrize(
