@@ -111,7 +111,7 @@ def run_trials(
                 workplace, slots, replicas, str(config.device), env.obs_type != "state",
                 snapshot_dir=env.snapshot_dir or None,
             )  # fmt: skip
-            run.keep = partial(_keep_actions, folder / ACTIONS_FOLDER)
+            run.on_trial_end = partial(_keep_actions, folder / ACTIONS_FOLDER)
             count = [len(units) - len(todo)]
 
             def told(row: TrialRow) -> None:

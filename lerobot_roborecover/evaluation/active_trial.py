@@ -1,59 +1,34 @@
-"""A seat of the engine: a slot, and the trial that sits in it."""
+"""A simulator worker, and the trial that runs in it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from lerobot_roborecover.evaluation.trial import Trial, TrialState
 from lerobot_roborecover.evaluation.videos import VideoWriter
 from lerobot_roborecover.evaluation.work_items import WorkItem
 from lerobot_roborecover.policies.runner import Replica
 from lerobot_roborecover.scenario import TrialStart
-from lerobot_roborecover.workers.messages import Reply
-
-
-class EngineSlot(Protocol):
-    """Where a simulator lives: `opening`, `ready` and `opened` as `host.Replica` has them."""
-
-    @property
-    def opening(self) -> bool:
-        """Whether it cannot be asked yet."""
-
-    @property
-    def ready(self) -> Any:
-        """What the engine's wait function waits on for the reply; True where it is there already."""
-
-    @property
-    def deadline(self) -> float:
-        """When the command under way counts as hung, on the engine's clock."""
-
-    def opened(self) -> None:
-        """Finds out whether the opening has worked."""
-
-    def send(self, command: str, argument: object = None) -> None:
-        """Starts a command."""
-
-    def receive(self) -> Reply:
-        """Its reply."""
+from lerobot_roborecover.workers.slots import SimulatorWorker
 
 
 @dataclass(eq=False)
 class WorkerState:
-    """A slot and who sits there."""
+    """A worker and its trial."""
 
-    slot: EngineSlot
+    slot: SimulatorWorker
     last: WorkItem[TrialStart] | None = None
-    """Who sat there last, or sits there."""
-    sitting: ActiveTrial | None = None
+    """The last or current work item."""
+    active: ActiveTrial | None = None
     """None where it is idle."""
 
 
 @dataclass(eq=False)
 class ActiveTrial:
-    """A trial in its seat."""
+    """A trial that runs in a worker."""
 
-    seat: WorkerState
+    worker: WorkerState
     unit: WorkItem[TrialStart]
     trial: Trial
     """Of `unit`."""

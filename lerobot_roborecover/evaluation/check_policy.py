@@ -105,7 +105,7 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
         cfg: what an evaluation would run with.
 
     Raises:
-        OptionError, ScenarioError, TrialLogError: see `env.run.create_session`.
+        OptionError, ScenarioError, TrialLogError: see `session.create_session`.
     """
     config = cfg.given_policy
     wanted = config.input_features or {}

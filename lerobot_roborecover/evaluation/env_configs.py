@@ -82,7 +82,7 @@ class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
     def create_envs(  # ty: ignore[incompatible-method-override]
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[str, ScenarioVectorEnv]]:
-        """`{group: {scenario id: vector env}}`; raises what `run_spec` and `env.run.create_session` raise."""
+        """`{group: {scenario id: vector env}}`; raises what `run_spec` and `session.create_session` raise."""
         choose_processors_in_scripts()
         return create_recovery_envs(
             self, self.run_spec(), n_envs=n_envs, workers=use_async_envs, facts=metadata_of_caller(self)

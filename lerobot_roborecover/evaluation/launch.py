@@ -72,11 +72,11 @@ def open_engine(
         return open_local_engine(run, units, make_host, slots, drawing, stop=stop, **options)
     from lerobot_roborecover.evaluation.ray_engine import open_ray_engine
 
-    opening = WorkerStartup(first=("fingerprint", None), check=check_smoke)
+    startup = WorkerStartup(first=("fingerprint", None), check=check_smoke)
     if places.draws:
         (first,) = first_units(units, 1)
         drawing = partial(node_drawing, places.render_device)
-        opening = WorkerStartup(drawing, ("smoke", first.scenario), check_smoke)
+        startup = WorkerStartup(drawing, ("smoke", first.scenario), check_smoke)
     return open_ray_engine(
         run,
         make_host,
@@ -84,7 +84,7 @@ def open_engine(
         slots=places.slots,
         replicas=places.replicas,
         gpus=1.0 if places.device.startswith("cuda") else 0.0,
-        opening=opening,
+        startup=startup,
         snapshot_dir=places.snapshot_dir,
         most=len(units),
         **options,

@@ -97,24 +97,24 @@ class RayReplica(RestartableActor):
         """Gives back what a trial held."""
         self._actor.finish.remote(history)
 
-    def ask(self, observations: list, instructions: list[str], histories: list) -> None:
+    def submit(self, observations: list, instructions: list[str], histories: list) -> None:
         """Begins an inference."""
         self.ready = self._actor.act.remote(observations, instructions, histories)
         self.deadline = time.monotonic() + self._limit_s
 
-    def answer(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError]:
+    def result(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError]:
         """Its result.
 
         Args:
             stop: not asked: the engine calls when the result is there, or overdue.
 
         Raises:
-            ReplicaHungError: the inference has taken too long; another replica is opening.
-            ReplicaLostError: the node is gone; another replica is opening.
+            ReplicaHungError: the inference has taken too long; another replica is startup.
+            ReplicaLostError: the node is gone; another replica is startup.
         """
         overdue, self.deadline = time.monotonic() >= self.deadline, float("inf")
         if overdue and not wait_for_calls([self.ready], 0.0):
-            self._open_again()
+            self._start_again()
             raise ReplicaHungError(hang_reason(self._limit_s))
         try:
             chunks, self.max_batch = self._result()
@@ -131,7 +131,7 @@ def open_ray_engine(
     slots: int,
     replicas: int,
     gpus: float,
-    opening: WorkerStartup,
+    startup: WorkerStartup,
     snapshot_dir: str | None = None,
     most: int | None = None,
     **options: Any,
@@ -145,7 +145,7 @@ def open_ray_engine(
         slots: simulators; 0 takes the CPUs that replicas leave over.
         replicas: copies of the policy; 0 takes one per GPU, or one where the policy runs on the CPU.
         gpus: of each replica.
-        opening: what simulators do first.
+        startup: what simulators do first.
         snapshot_dir: folder of handoff snapshots on a file system that all nodes share; None keeps them in
             each slot's memory.
         most: simulators that have something to do, at most.
@@ -166,7 +166,7 @@ def open_ray_engine(
             f"({workplace.device}=cpu)"
         )
     count = cluster.room(slots, replicas)
-    cluster.make_slots(opening)
+    cluster.make_slots(startup)
     run.pool.configure(snapshot_dir=snapshot_dir)
     seats = run.pool.worker_slots(count if most is None else min(count, most))
     # What decides how policies round here decides it there: torch reads these variables when it is loaded.

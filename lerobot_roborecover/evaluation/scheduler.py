@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
-from lerobot_roborecover.evaluation.active_trial import ActiveTrial, EngineSlot, WorkerState
+from lerobot_roborecover.evaluation.active_trial import ActiveTrial, WorkerState
 from lerobot_roborecover.evaluation.batching import BatchTimer
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import Act, Trial
@@ -32,9 +32,9 @@ from lerobot_roborecover.policies.runner import (
 )
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, TrialStart
 from lerobot_roborecover.utils.text import pluralize
-from lerobot_roborecover.workers.control_columns import split
+from lerobot_roborecover.workers.control_columns import strip_columns
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackReply, SlotFailure
-from lerobot_roborecover.workers.slots import MAX_ATTEMPTS
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
 
 MAX_CONSECUTIVE_FAILURES = 3
 """Simulator failures of one scenario in a row after which its other trials are not tried."""
@@ -43,7 +43,7 @@ _POLL_S = 0.5
 
 type Waiter = Callable[[list[Any], float], Collection[Any]]
 """Waits for any of some handles, at most so many seconds; those that are ready."""
-type Event = tuple[Replica | EngineSlot, Callable[[], None]]
+type Event = tuple[Replica | SimulatorWorker, Callable[[], None]]
 """Whom to wait for, and what to do then."""
 
 
@@ -66,7 +66,7 @@ class Engine:
     def __init__(
         self,
         run: EvalSession,
-        slots: Sequence[EngineSlot],
+        slots: Sequence[SimulatorWorker],
         replicas: Sequence[Replica],
         wait: Waiter,
         *,
@@ -79,7 +79,7 @@ class Engine:
         self._clock, self._queue_of = clock, queue_of
         self._run, self._replicas, self._wait = run, list(replicas), wait
         self._on_row, self._videos = on_row, videos
-        self._seats = [WorkerState(slot) for slot in slots]
+        self._workers = [WorkerState(slot) for slot in slots]
         self._asked: dict[Replica, tuple[list[ActiveTrial], float]] = {}
         self._company = {r: BatchTimer(batch_delay_s) for r in self._replicas}
         self._failures: dict[str, int] = {}
@@ -114,9 +114,9 @@ class Engine:
             if not events:
                 break
             self._collect(events, _POLL_S)
-        for sitting in self._sittings():
-            if sitting.recording is not None:
-                sitting.recording.drop()
+        for active in self._sittings():
+            if active.recording is not None:
+                active.recording.drop()
         reasons = [r.gone for r in self._replicas if r.gone]
         if len(reasons) == len(self._replicas) and not stop():
             while (unit := self._queue.take(None)) is not None:
@@ -138,8 +138,8 @@ class Engine:
             )
 
     def _sittings(self) -> list[ActiveTrial]:
-        """The trials under way, in the order of their seats."""
-        return [s.sitting for s in self._seats if s.sitting is not None]
+        """The trials under way, in the order of their workers."""
+        return [s.active for s in self._workers if s.active is not None]
 
     def _sittings_of(self, replica: Replica) -> list[ActiveTrial]:
         return [s for s in self._sittings() if s.replica is replica]
@@ -147,29 +147,29 @@ class Engine:
     # --- events
 
     def _fill(self) -> None:
-        """Gives the next units to the seats without one."""
-        for seat in self._seats:
-            if seat.sitting is not None or seat.slot.opening:
+        """Gives the next units to the workers without one."""
+        for worker in self._workers:
+            if worker.active is not None or worker.slot.starting:
                 continue
             replica = self._least_busy()
             if replica is None:
                 return
-            unit = self._queue.take(seat.last, [s.unit.task for s in self._sittings()])
+            unit = self._queue.take(worker.last, [s.unit.task for s in self._sittings()])
             if unit is None:
                 return
-            self._start(seat, unit, replica)
+            self._start(worker, unit, replica)
 
     def _least_busy(self) -> Replica | None:
         users = [s.replica for s in self._sittings()]
-        able = (r for r in self._replicas if not (r.opening or r.gone))
+        able = (r for r in self._replicas if not (r.starting or r.gone))
         return min(able, key=users.count, default=None)
 
-    def _start(self, seat: WorkerState, unit: WorkItem[TrialStart], replica: Replica) -> None:
+    def _start(self, worker: WorkerState, unit: WorkItem[TrialStart], replica: Replica) -> None:
         trial = self._run.trial(unit.scenario, unit.trial)
-        seat.last = unit
-        seat.sitting = ActiveTrial(seat, unit, trial, replica, trial.open_history(replica.host))
+        worker.last = unit
+        worker.active = ActiveTrial(worker, unit, trial, replica, trial.open_history(replica.host))
         filmed = self._videos is not None and self._videos.wants(unit)
-        seat.slot.send("reset", trial.begin(filmed))
+        worker.slot.send("reset", trial.begin(filmed))
 
     def _ask(self, replica: Replica) -> bool:
         """Asks a free replica about the trials that wait for it, unless more company is to be expected."""
@@ -179,7 +179,7 @@ class Engine:
         waiting = [s for s in self._sittings_of(replica) if s.waiting]
         asking = sorted(waiting, key=lambda s: s.waiting_since)[: replica.host.max_batch]
         self._asked[replica] = asking, self._clock()
-        replica.ask(
+        replica.submit(
             [s.trial.ask() for s in asking],
             [s.unit.scenario.task.instruction for s in asking],
             [s.history for s in asking],
@@ -188,7 +188,7 @@ class Engine:
 
     def _ask_at(self, replica: Replica) -> float | None:
         """Returns when to send a batch to a replica; None where no trial waits for it, or it is busy."""
-        if replica.opening or replica in self._asked:
+        if replica.starting or replica in self._asked:
             return None
         mine = self._sittings_of(replica)
         waiting = [s.waiting_since for s in mine if s.waiting]
@@ -202,10 +202,10 @@ class Engine:
         """What can happen next."""
         events: list[Event] = []
         events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
-        events += [(s.seat.slot, lambda s=s: self._replied(s)) for s in self._sittings() if s.working]
+        events += [(s.worker.slot, lambda s=s: self._replied(s)) for s in self._sittings() if s.working]
         if len(self._queue):
-            parties = [*self._replicas, *(s.slot for s in self._seats)]
-            events += [(p, p.opened) for p in parties if p.opening]
+            parties = [*self._replicas, *(s.slot for s in self._workers)]
+            events += [(p, p.poll_startup) for p in parties if p.starting]
         return events
 
     def _collect(self, events: list[Event], timeout_s: float) -> bool:
@@ -246,17 +246,17 @@ class Engine:
     def _answered(self, replica: Replica) -> None:
         asked, began = self._asked.pop(replica)
         try:
-            answers = replica.answer(self._stop)
+            answers = replica.result(self._stop)
         except ReplicaLostError as err:
             if isinstance(err, ReplicaHungError):
-                for sitting in asked:
-                    sitting.trial.refused(err, seconds=self._clock() - began)
-                    sitting.replica = None
-                    self._finish(sitting)
-            for sitting in self._sittings_of(replica):
-                sitting.replica = None
-                if not sitting.working:  # one that works is given up when its slot has replied
-                    self._lost(sitting, str(err))
+                for active in asked:
+                    active.trial.refused(err, seconds=self._clock() - began)
+                    active.replica = None
+                    self._finish(active)
+            for active in self._sittings_of(replica):
+                active.replica = None
+                if not active.working:  # one that works is given up when its slot has replied
+                    self._lost(active, str(err))
             return
         if answers is None:
             return
@@ -264,86 +264,86 @@ class Engine:
             answers = [PolicyError(problem)] * len(asked)
         seconds = self._clock() - began
         self._company[replica].inferred(len(asked), seconds)
-        for sitting, chunk in zip(asked, answers, strict=True):
-            trial, slot = sitting.trial, sitting.seat.slot
+        for active, chunk in zip(asked, answers, strict=True):
+            trial, slot = active.trial, active.worker.slot
             if isinstance(chunk, PolicyUnavailableError):
-                self._away(sitting, str(chunk))
+                self._away(active, str(chunk))
                 continue
             if isinstance(chunk, PolicyError):
                 trial.refused(chunk, seconds=seconds)
             else:
-                actions, directives = split(chunk, self._run.action_width(sitting.unit.scenario))
+                actions, directives = strip_columns(chunk, self._run.action_width(active.unit.scenario))
                 move = trial.decide(actions, directives, seconds=seconds)
-                sitting.answered_at, sitting.answered_with = self._clock(), len(asked)
+                active.answered_at, active.answered_with = self._clock(), len(asked)
                 if isinstance(move, Act):
                     slot.send("act", move.actions)
                 elif move is not None:
                     slot.send("rollback", move.steps)
             if trial.over:
-                self._finish(sitting)
+                self._finish(active)
 
-    def _replied(self, sitting: ActiveTrial) -> None:
-        reply = sitting.seat.slot.receive()
-        sitting.waiting_since = self._clock()
-        if sitting.replica is None:
-            self._lost(sitting, "the policy's process was lost")
+    def _replied(self, active: ActiveTrial) -> None:
+        reply = active.worker.slot.receive()
+        active.waiting_since = self._clock()
+        if active.replica is None:
+            self._lost(active, "the policy's process was lost")
             return
         if isinstance(reply, SlotFailure) and reply.kind == "lost":
-            self._lost(sitting, reply.message)
+            self._lost(active, reply.message)
             return
         if isinstance(reply, ActResult) and not reply.over:
-            self._company[sitting.replica].simulated(sitting.answered_with, reply.seconds)
-        sitting.trial.take(reply)
+            self._company[active.replica].simulated(active.answered_with, reply.seconds)
+        active.trial.take(reply)
         if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
-            sitting.recording = self._videos.begin(sitting.unit, reply.frame, reply.hz)
-        elif sitting.recording is not None and isinstance(reply, ActResult):
-            sitting.recording.add(reply.frames)
-        elif sitting.recording is not None and isinstance(reply, RollbackReply) and reply.frame is not None:
-            sitting.recording.add((reply.frame,))
-        if sitting.trial.over:
-            self._finish(sitting)
+            active.recording = self._videos.begin(active.unit, reply.frame, reply.hz)
+        elif active.recording is not None and isinstance(reply, ActResult):
+            active.recording.add(reply.frames)
+        elif active.recording is not None and isinstance(reply, RollbackReply) and reply.frame is not None:
+            active.recording.add((reply.frame,))
+        if active.trial.over:
+            self._finish(active)
 
     # --- ends
 
-    def _lost(self, sitting: ActiveTrial, reason: str) -> None:
+    def _lost(self, active: ActiveTrial, reason: str) -> None:
         """The trial's machine is gone: it is run again from its start, elsewhere."""
-        if self._lost_again(sitting):
-            sitting.trial.fail(Outcome.SIM_ERROR, f"lost {MAX_ATTEMPTS} times, last: {reason}")
-            self._finish(sitting)
+        if self._lost_again(active):
+            active.trial.fail(Outcome.SIM_ERROR, f"lost {MAX_ATTEMPTS} times, last: {reason}")
+            self._finish(active)
             return
-        self._run_again(sitting)
+        self._run_again(active)
 
-    def _away(self, sitting: ActiveTrial, reason: str) -> None:
+    def _away(self, active: ActiveTrial, reason: str) -> None:
         """Handles a policy that could not be reached: the trial is run again from its start.
 
         After `MAX_ATTEMPTS` losses the trial is left without a row, for a later run.
         """
-        unit = sitting.unit
-        if self._lost_again(sitting):
+        unit = active.unit
+        if self._lost_again(active):
             self.unrun[unit.scenario.id, unit.trial] = reason
-            self._leave(sitting)
+            self._leave(active)
         else:
-            self._run_again(sitting)
+            self._run_again(active)
 
-    def _lost_again(self, sitting: ActiveTrial) -> bool:
+    def _lost_again(self, active: ActiveTrial) -> bool:
         """Counts a loss; whether it was one too many."""
-        key = (sitting.unit.scenario.id, sitting.unit.trial)
+        key = (active.unit.scenario.id, active.unit.trial)
         self._losses[key] = self._losses.get(key, 0) + 1
         return self._losses[key] >= MAX_ATTEMPTS
 
-    def _run_again(self, sitting: ActiveTrial) -> None:
+    def _run_again(self, active: ActiveTrial) -> None:
         self.reruns += 1
-        self._queue.put_back(sitting.unit)
-        self._leave(sitting)
+        self._queue.put_back(active.unit)
+        self._leave(active)
 
-    def _finish(self, sitting: ActiveTrial) -> None:
-        unit, trial = sitting.unit, sitting.trial
+    def _finish(self, active: ActiveTrial) -> None:
+        unit, trial = active.unit, active.trial
         outcome = trial.verdict()
-        if self._videos is not None and sitting.recording is not None:
-            self._videos.finish(sitting.recording, unit, outcome)
-            sitting.recording = None
-        self._record(trial, sitting.replica or self._replicas[0])
-        self._leave(sitting)
+        if self._videos is not None and active.recording is not None:
+            self._videos.finish(active.recording, unit, outcome)
+            active.recording = None
+        self._record(trial, active.replica or self._replicas[0])
+        self._leave(active)
         broke = outcome in (Outcome.SIM_ERROR, Outcome.TIMEOUT)
         count = self._failures[unit.scenario.id] = self._failures.get(unit.scenario.id, 0) + 1 if broke else 0
         if count >= MAX_CONSECUTIVE_FAILURES:
@@ -353,12 +353,12 @@ class Engine:
                 parked.fail(outcome, text)
                 self._record(parked, self._replicas[0])
 
-    def _leave(self, sitting: ActiveTrial) -> None:
-        if sitting.replica is not None:
-            sitting.replica.host.finish(sitting.history)
-        if sitting.recording is not None:
-            sitting.recording.drop()
-        sitting.seat.sitting = None
+    def _leave(self, active: ActiveTrial) -> None:
+        if active.replica is not None:
+            active.replica.host.finish(active.history)
+        if active.recording is not None:
+            active.recording.drop()
+        active.worker.active = None
 
     def _record(self, trial: Trial, replica: Replica) -> None:
         host = replica.host

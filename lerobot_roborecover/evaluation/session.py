@@ -76,8 +76,8 @@ class EvalSession:
     """None where the simulator waits for the policy."""
     policy_watchdog_s: float = POLICY_WATCHDOG_S
     """Longest that one inference may take; infinite where it may take for ever."""
-    keep: Callable[[Trial, TrialRow], None] = lambda trial, row: None
-    """Told of a trial that is over before its row is in the log: what it keeps is there for every row."""
+    on_trial_end: Callable[[Trial, TrialRow], None] = lambda trial, row: None
+    """Called when a trial ends, before its row is written: what it saves exists for every row."""
 
     def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
@@ -150,7 +150,7 @@ class EvalSession:
             batch_size=batch_size,
             extent=self.extent,
         )
-        self.keep(trial, row)
+        self.on_trial_end(trial, row)
         if self.log is not None:
             self.log.append(row)
         return row
@@ -239,7 +239,7 @@ def create_session(
     )
     if options.record_actions:
         folder = log.path.with_name(ACTIONS_FOLDER)
-        run.keep = lambda trial, row: put_actions(folder, trial.actions, row)
+        run.on_trial_end = lambda trial, row: put_actions(folder, trial.actions, row)
     return scenarios, run
 
 

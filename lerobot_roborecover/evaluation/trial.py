@@ -99,7 +99,7 @@ class RollbackRequest:
     """A decision: put the simulation back instead of acting."""
 
     steps: int
-    """How many; `directives.BY_RULE` for the platform's number."""
+    """How many; `control_columns.BY_RULE` for the platform's number."""
 
 
 class PolicyStateFactory(Interface):

@@ -35,7 +35,7 @@ from lerobot_roborecover.policies.action_checks import count_problem
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.policies.watchdog import PolicyWatch
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.workers.control_columns import split
+from lerobot_roborecover.workers.control_columns import strip_columns
 
 _FALLBACK_FRAME = (64, 64, 3)
 
@@ -128,13 +128,13 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         """Advances every running trial by one step; a trial that is told to go back does so instead.
 
         Args:
-            actions: (num_envs, action width), or as many columns more as `directives.WIDTH`.
+            actions: (num_envs, action width), or as many columns more as `control_columns.WIDTH`.
         """
         self._stop_watch()
         waited = time.perf_counter() - self._replied
         slots = self.run.pool.slots(self.num_envs)
         before = np.array([t.over for t in self._trials])
-        actions, directives = split(np.asarray(actions), self.run.action_width(self.scenario))
+        actions, directives = strip_columns(np.asarray(actions), self.run.action_width(self.scenario))
         miscounted = count_problem(len(actions) if actions.ndim else 0, self.num_envs)
         working = []
         for index, trial in enumerate(self._trials):

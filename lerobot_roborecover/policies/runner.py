@@ -100,8 +100,8 @@ class Replica(Protocol):
         """What is asked of it at once."""
 
     @property
-    def opening(self) -> bool:
-        """Whether it cannot be asked yet; `ready` then says when to call `opened`."""
+    def starting(self) -> bool:
+        """Whether it cannot be asked yet; `ready` then says when to call `poll_startup`."""
 
     @property
     def gone(self) -> str:
@@ -115,13 +115,13 @@ class Replica(Protocol):
     def deadline(self) -> float:
         """When the inference under way counts as hung, on the engine's clock."""
 
-    def opened(self) -> None:
+    def poll_startup(self) -> None:
         """Finds out whether the opening has worked; it may have begun again."""
 
-    def ask(self, observations: list, instructions: list[str], histories: list) -> None:
+    def submit(self, observations: list, instructions: list[str], histories: list) -> None:
         """Begins an inference."""
 
-    def answer(self, stop: Callable[[], bool]) -> list[Chunk | PolicyError] | None:
+    def result(self, stop: Callable[[], bool]) -> list[Chunk | PolicyError] | None:
         """Its result.
 
         Args:
@@ -145,7 +145,7 @@ class InlineReplica:
         limit_s: the watchdog: longest that one inference may take.
     """
 
-    opening = False
+    starting = False
     ready = True
     deadline = float("inf")
 
@@ -155,14 +155,14 @@ class InlineReplica:
         self._thread, self._limit_s = thread or PolicyThread(), limit_s
         self._asked: tuple[list, list[str], list] = ([], [], [])
 
-    def opened(self) -> None:
+    def poll_startup(self) -> None:
         """Nothing to find out."""
 
-    def ask(self, observations: list, instructions: list[str], histories: list) -> None:
+    def submit(self, observations: list, instructions: list[str], histories: list) -> None:
         """Remembers the question."""
         self._asked = (observations, instructions, histories)
 
-    def answer(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError] | None:
+    def result(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError] | None:
         """Infers.
 
         Args:
@@ -222,9 +222,9 @@ class WatchedHost:
     ) -> list[Chunk | PolicyError]:
         """One answer per observation; an error for each where an inference has hung, now or before."""
         if not self._replica.gone:
-            self._replica.ask(list(observations), list(instructions), list(histories))
+            self._replica.submit(list(observations), list(instructions), list(histories))
             try:
-                answers = self._replica.answer() or []
+                answers = self._replica.result() or []
             except ReplicaHungError:
                 pass
             else:

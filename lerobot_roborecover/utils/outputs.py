@@ -4,9 +4,9 @@
 - A page that is made from results, such as a report, replaces an earlier page of the same command, and
   no other file of those names.
 - A file that a process has locked, such as the log of a running evaluation, is never replaced
-  (`whole.atomic_file`).
+  (`atomic_io.atomic_file`).
 
-Folders of datasets are new or empty (`whole.check_new`).
+Folders of datasets are new or empty (`atomic_io.check_new`).
 """
 
 from __future__ import annotations

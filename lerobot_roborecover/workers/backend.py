@@ -74,14 +74,16 @@ class Backend:
                 "'lerobot_env_roborecover[ray]', on every node"
             )
 
-    def settle(self, pool: SlotPool, count: int, here: int, opening: WorkerStartup | None = None) -> int:
+    def allocate_workers(
+        self, pool: SlotPool, count: int, here: int, startup: WorkerStartup | None = None
+    ) -> int:
         """Has a pool's slots made here.
 
         Args:
             pool: of worker processes, none of them started.
             count: slots that are asked for; 0 takes what there is room for.
             here: that is, on this machine.
-            opening: what they do first, on a cluster.
+            startup: what they do first, on a cluster.
 
         Returns:
             How many slots there may be.
@@ -94,7 +96,7 @@ class Backend:
         from lerobot_roborecover.workers.cluster import Cluster
 
         cluster = Cluster(self, pool)
-        cluster.make_slots(opening or WorkerStartup())
+        cluster.make_slots(startup or WorkerStartup())
         return cluster.room(count)
 
 

@@ -90,18 +90,18 @@ class RestartableActor:
     def __init__(self, make: Callable[[bool], Any], first: Callable[[Any], Any]):
         self._make, self._first = make, first
         self._failed = 0
-        self._open(again=False)
+        self._start(again=False)
 
-    def _open(self, *, again: bool) -> None:
-        self.opening = True
+    def _start(self, *, again: bool) -> None:
+        self.starting = True
         self._actor = self._make(again)
         self.ready = self._first(self._actor)
 
-    def _open_again(self) -> None:
+    def _start_again(self) -> None:
         self.close()
-        self._open(again=True)
+        self._start(again=True)
 
-    def opened(self) -> None:
+    def poll_startup(self) -> None:
         """Finds out whether the actor is there; if its node went away meanwhile, begins again.
 
         Raises:
@@ -117,10 +117,10 @@ class RestartableActor:
                     f"row; the last time: {err}. Every node needs this package with its extras, in the same "
                     "version, and memory for a simulator per CPU"
                 ) from None
-            self._open_again()
+            self._start_again()
             return
         self._is_there(answer)
-        self._failed, self.opening = 0, False
+        self._failed, self.starting = 0, False
 
     def _is_there(self, answer: Any) -> None:
         """Takes what the first call said."""
@@ -129,12 +129,12 @@ class RestartableActor:
         """Of the call under way.
 
         Raises:
-            ActorGoneError: the actor is gone, and another one is opening.
+            ActorGoneError: the actor is gone, and another one is startup.
         """
         try:
             return result_of(self.ready)
         except ActorGoneError:
-            self._open_again()
+            self._start_again()
             raise
 
     def close(self) -> None:
@@ -212,8 +212,8 @@ class RaySlot(RestartableActor):
 
     def send(self, command: str, argument: object = None) -> None:
         """Starts a command, once the slot is open."""
-        while self.opening:
-            self.opened()
+        while self.starting:
+            self.poll_startup()
         self.ready, self._working = self._actor.run.remote(command, argument), True
 
     def receive(self) -> Reply:
@@ -228,8 +228,8 @@ class RaySlot(RestartableActor):
         """Ends the worker process at once, whatever it does; the next command starts another."""
         if self._working:  # its actor hears of nothing else until that is done
             self._working = False
-            self._open_again()
-        elif not self.opening:
+            self._start_again()
+        elif not self.starting:
             self._actor.end.remote()
 
 
@@ -299,7 +299,7 @@ class Cluster:
             )
         return slots
 
-    def make_slots(self, opening: WorkerStartup) -> None:
+    def make_slots(self, startup: WorkerStartup) -> None:
         """Has the pool's slots made on the cluster, one CPU each, spread over its nodes."""
         actor = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(SlotActor)
 
@@ -307,8 +307,8 @@ class Cluster:
             def put(again: bool) -> Any:
                 # Where policies have all CPUs that are left, one simulator goes on all the same.
                 one = actor.options(num_cpus=0) if again and turn == 0 else actor
-                return one.remote(config, timeout_s, turn, opening.environment, opening.first)
+                return one.remote(config, timeout_s, turn, startup.environment, startup.first)
 
-            return RaySlot(put, config.platform, opening.check)
+            return RaySlot(put, config.platform, startup.check)
 
         self._pool.make_with(make)

@@ -57,7 +57,7 @@ class ControlColumns:
         return [SIGNATURE, float(self.rollback), float(self.controller), score, self.monitor_s]
 
 
-def attach(actions: np.ndarray, first: ControlColumns) -> np.ndarray:
+def append_columns(actions: np.ndarray, first: ControlColumns) -> np.ndarray:
     """(n, A + 5): actions with their directives; what the monitor said stands beside the first alone.
 
     Args:
@@ -69,7 +69,7 @@ def attach(actions: np.ndarray, first: ControlColumns) -> np.ndarray:
     return np.concatenate([actions, np.asarray(columns, actions.dtype)], axis=1)
 
 
-def split(rows: np.ndarray, width: int) -> tuple[np.ndarray, list[ControlColumns] | None]:
+def strip_columns(rows: np.ndarray, width: int) -> tuple[np.ndarray, list[ControlColumns] | None]:
     """Takes the directives off.
 
     Args:

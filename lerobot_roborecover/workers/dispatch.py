@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot_roborecover.workers.messages import InProgress, SlotFailure
-from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, ProcessSlot
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
 
 _POLL_S = 1.0
 
@@ -27,7 +27,7 @@ class _Handed[Item]:
 
 
 def map_unordered[Item](
-    slots: Sequence[ProcessSlot],
+    slots: Sequence[SimulatorWorker],
     command: str,
     take: Take[Item],
     argument: Callable[[Item], Any],
@@ -60,19 +60,19 @@ def map_unordered[Item](
         while True:
             idle = [k for k in range(len(slots)) if k not in busy]
             for k in idle:
-                if not slots[k].opening and (handed := next_for(k)) is not None:
+                if not slots[k].starting and (handed := next_for(k)) is not None:
                     slots[k].send(command, argument(handed.item))
                     busy[k], last[k] = handed, handed.item
-            # Only an item at hand says that slots which are opening are still needed.
-            if idle and all(slots[k].opening for k in idle) and (handed := next_for(idle[0])) is not None:
+            # Only an item at hand says that slots which are starting are still needed.
+            if idle and all(slots[k].starting for k in idle) and (handed := next_for(idle[0])) is not None:
                 waiting.appendleft(handed)
-            opening = [k for k in idle if slots[k].opening and waiting]
-            if not busy and not opening:
+            starting = [k for k in idle if slots[k].starting and waiting]
+            if not busy and not starting:
                 return
-            for k in _ready(slots, [*busy, *opening]):
+            for k in _ready(slots, [*busy, *starting]):
                 slot = slots[k]
                 if k not in busy:
-                    slot.opened()
+                    slot.poll_startup()
                     continue
                 reply = slot.receive()
                 if isinstance(reply, InProgress):
@@ -93,7 +93,7 @@ def map_unordered[Item](
             slots[k].end()
 
 
-def _ready(slots: Sequence[ProcessSlot], parties: Sequence[int]) -> list[int]:
+def _ready(slots: Sequence[SimulatorWorker], parties: Sequence[int]) -> list[int]:
     """Which of the slots have something to say, once any has."""
     waited = [slots[k].ready for k in parties if slots[k].ready is not True]
     soon = min(slots[k].deadline for k in parties) - time.monotonic()
@@ -107,7 +107,7 @@ def _ready(slots: Sequence[ProcessSlot], parties: Sequence[int]) -> list[int]:
 
 
 def map_ordered[Item](
-    slots: Sequence[ProcessSlot], command: str, items: Sequence[Item], argument: Callable[[Item], Any]
+    slots: Sequence[SimulatorWorker], command: str, items: Sequence[Item], argument: Callable[[Item], Any]
 ) -> Iterator[Any]:
     """Replies in the order of the items, with few of them ahead of the caller: they are large.
 

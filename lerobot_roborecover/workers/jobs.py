@@ -25,7 +25,7 @@ from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.dispatch import map_ordered, map_unordered
 from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
-from lerobot_roborecover.workers.slots import ProcessSlot, SlotPool
+from lerobot_roborecover.workers.slots import SimulatorWorker, SlotPool
 
 SERVER = f"{__name__}:JobServer"
 
@@ -212,10 +212,10 @@ class JobPool:
 
     def _most(self) -> int:
         """How many processes there may be."""
-        self._settled = self._settled or self._workplace.settle(self._pool, self._asked, 1)
+        self._settled = self._settled or self._workplace.allocate_workers(self._pool, self._asked, 1)
         return self._settled
 
-    def _slots(self, count: int) -> list[ProcessSlot]:
+    def _slots(self, count: int) -> list[SimulatorWorker]:
         return self._pool.worker_slots(count)
 
 

@@ -45,12 +45,12 @@ class Slot(Protocol):
         """Ends the slot."""
 
 
-class ProcessSlot(Slot, Protocol):
+class SimulatorWorker(Slot, Protocol):
     """A slot in a process of its own, so that its caller need not wait: here, or on a cluster."""
 
     @property
-    def opening(self) -> bool:
-        """Whether it cannot be asked yet; `ready` then says when to call `opened`."""
+    def starting(self) -> bool:
+        """Whether it cannot be asked yet; `ready` then says when to call `poll_startup`."""
 
     @property
     def ready(self) -> Any:
@@ -60,7 +60,7 @@ class ProcessSlot(Slot, Protocol):
     def deadline(self) -> float:
         """When the command under way counts as hung, on the monotonic clock."""
 
-    def opened(self) -> None:
+    def poll_startup(self) -> None:
         """Finds out whether the opening has worked; it may have begun again."""
 
     def wait(self, handles: list[Any], timeout_s: float) -> Collection[Any]:
@@ -114,7 +114,7 @@ class WorkerSlot:
         timeout_s: longest any one command may take before the worker is taken for hung.
     """
 
-    opening = False
+    starting = False
     """A command can be sent at once: it waits in the socket until the worker has started."""
     wait = staticmethod(wait)
 
@@ -139,7 +139,7 @@ class WorkerSlot:
         assert self._channel is not None
         return self._channel.connection
 
-    def opened(self) -> None:
+    def poll_startup(self) -> None:
         """Nothing to find out."""
 
     @property
@@ -317,9 +317,9 @@ class SlotPool:
             self._slots.append(self._make(self._config, self._timeout_s, len(self._slots)))
         return self._slots[:count]
 
-    def worker_slots(self, count: int) -> list[ProcessSlot]:
+    def worker_slots(self, count: int) -> list[SimulatorWorker]:
         """The first `count` slots, of a pool whose slots are processes of their own."""
-        return [cast(ProcessSlot, slot) for slot in self.slots(count) if not isinstance(slot, InlineSlot)]
+        return [cast(SimulatorWorker, slot) for slot in self.slots(count) if not isinstance(slot, InlineSlot)]
 
     def ask(self, command: str) -> Reply:
         """The first slot's reply to a command that has no argument."""

@@ -45,8 +45,8 @@ def schedule(
         for k in range(slots)
     ]  # fmt: skip
     run = EvalSession(None, EvalProtocol("recovery", 0, "p", 0, chunk), None, "d", None)
-    seats = [VirtualSlot(world) for _ in range(slots)]
-    engine = Engine(run, seats, [InlineReplica(host)], world.wait, clock=world.clock)
+    workers = [VirtualSlot(world) for _ in range(slots)]
+    engine = Engine(run, workers, [InlineReplica(host)], world.wait, clock=world.clock)
     assert engine.run(units_of(scenarios, trials)) == slots * trials
     return world, host
 

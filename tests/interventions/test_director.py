@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.policies.runner import PolicyError
-from lerobot_roborecover.workers.control_columns import BY_RULE, Controller, split
+from lerobot_roborecover.workers.control_columns import BY_RULE, Controller, strip_columns
 from tests.support.small_interventions import CountingMember, ScriptedDriver, observation
 
 pytestmark = pytest.mark.lerobot
@@ -60,7 +60,7 @@ def test_correction_acts_for_its_steps_and_both_sides_begin_afresh():
     rows, _ = run_alone(made, [0.0] * 10)
     who_and_step = [(r[0], r[1]) for r in rows]
     assert who_and_step == [(2, 0), (2, 1), (2, 2), (2, 3), (2, 4), (1, 0), (1, 1), (1, 2), (1, 3), (1, 4)]
-    _, directives = split(np.stack(rows), 3)
+    _, directives = strip_columns(np.stack(rows), 3)
     assert [d.controller for d in directives] == [Controller.CORRECTION] * 5 + [Controller.BASE] * 5
     assert not any(d.asked for d in directives)
     for member in made.members.values():
@@ -73,7 +73,7 @@ def test_the_monitor_is_asked_every_step_until_it_triggers_once():
     values = [1, 8, 2, 9, 9, 9, 9, 9, 9, 9]
     rows, _ = run_alone(made, values)
     assert monitor.asked == [1, 8, 2, 9]
-    _, directives = split(np.stack(rows), 3)
+    _, directives = strip_columns(np.stack(rows), 3)
     assert [d.asked for d in directives] == [True] * 4 + [False] * 6
     assert [r[0] for r in rows] == [1, 1, 1, 2, 2, 2, 2, 2, 1, 1]
     # The base's chunk of four is cut after three; when it is back, it begins anew.
@@ -85,7 +85,7 @@ def test_the_monitor_is_asked_every_step_until_it_triggers_once():
 def test_a_monitored_rollback_takes_a_turn_and_flushes_the_queue():
     made = director("monitor_reversion", monitor=At())
     rows, _ = run_alone(made, [1, 2, 9, 3, 3, 3])
-    _, directives = split(np.stack(rows), 3)
+    _, directives = strip_columns(np.stack(rows), 3)
     assert [d.rollback for d in directives] == [0, 0, BY_RULE, 0, 0, 0]
     assert [r[1] for r in rows] == [0, 1, 0, 0, 1, 2]
     assert (rows[2][:3] == 0).all()

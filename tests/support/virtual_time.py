@@ -60,7 +60,7 @@ class World:
 class VirtualSlot:
     """A slot of a world."""
 
-    opening, deadline = False, float("inf")
+    starting, deadline = False, float("inf")
 
     def __init__(self, world: World, handoff_steps: int = 2):
         self._world, self._handoff_steps = world, handoff_steps

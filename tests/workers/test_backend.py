@@ -54,5 +54,5 @@ def test_on_this_machine_nothing_is_joined():
         def __getattr__(self, name):
             raise AssertionError(f"{name} of a pool that stays here")
 
-    assert LOCAL.settle(Untouched(), 0, 3) == 3
-    assert LOCAL.settle(Untouched(), 5, 3) == 5
+    assert LOCAL.allocate_workers(Untouched(), 0, 3) == 3
+    assert LOCAL.allocate_workers(Untouched(), 5, 3) == 5

@@ -112,7 +112,7 @@ def test_a_cluster_that_cannot_do_the_work_is_refused(cluster, monkeypatch):
     ):
         pool.call(work, "a")
     pool = SlotPool(SlotConfig("fake"), workers=True, timeout_s=60)
-    RAY.settle(pool, 1, 1, WorkerStartup(no_device))
+    RAY.allocate_workers(pool, 1, 1, WorkerStartup(no_device))
     with pytest.raises(OptionError, match=r"node [0-9.]+ .*cannot begin: simulator 0 has nothing to draw on"):
         pool.ask("fingerprint")
     pool.close()

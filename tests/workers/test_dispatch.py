@@ -29,19 +29,19 @@ class FragileSlot:
         self._argument = None
         self.ended = 0
 
-    opening = property(lambda self: self._left > 0)
+    starting = property(lambda self: self._left > 0)
     ready = property(lambda self: self)
 
     @staticmethod
     def wait(handles, _timeout_s):
         return handles[:1]
 
-    def opened(self):
-        assert self.opening
+    def poll_startup(self):
+        assert self.starting
         self._left -= 1
 
     def send(self, command, argument=None):
-        assert not self.opening, "a slot that is not there was asked"
+        assert not self.starting, "a slot that is not there was asked"
         assert command == "run"
         if argument is not None:
             self._given[argument] += 1

@@ -20,8 +20,8 @@ from lerobot_roborecover.workers.control_columns import (
     WIDTH,
     ControlColumns,
     Controller,
-    attach,
-    split,
+    append_columns,
+    strip_columns,
 )
 from lerobot_roborecover.workers.recovery_env import RecoveryEnv
 from tests.support.factories import fake_dataset, fake_scenario
@@ -161,18 +161,18 @@ def check_real(env: RecoveryEnv, taken: int, backs: tuple[int, ...]) -> None:
 
 def test_directives_survive_float32_and_nothing_else_is_read_as_one():
     told = ControlColumns(BY_RULE, Controller.CORRECTION, True, 0.75, 0.5)
-    rows = attach(np.zeros((3, 4), np.float32), told)
-    actions, directives = split(rows, 4)
+    rows = append_columns(np.zeros((3, 4), np.float32), told)
+    actions, directives = strip_columns(rows, 4)
     assert actions.shape == (3, 4)
     assert directives[0] == told
     assert [d.asked for d in directives] == [True, False, False]
     assert {d.controller for d in directives} == {Controller.CORRECTION}
-    unread = split(attach(np.zeros((1, 2)), ControlColumns(asked=True)), 2)[1][0]
+    unread = strip_columns(append_columns(np.zeros((1, 2)), ControlColumns(asked=True)), 2)[1][0]
     assert unread.asked
     assert np.isnan(unread.score)
     wide = np.zeros((2, 4 + WIDTH), np.float32)
-    assert split(wide, 4)[1] is None
-    assert split(rows[:, :4], 4)[1] is None
+    assert strip_columns(wide, 4)[1] is None
+    assert strip_columns(rows[:, :4], 4)[1] is None
 
 
 class Rewinds:
@@ -189,7 +189,7 @@ class Rewinds:
 
 
 def attach_all(actions: np.ndarray, directive: ControlColumns) -> np.ndarray:
-    return np.concatenate([attach(a[None], directive) for a in actions])
+    return np.concatenate([append_columns(a[None], directive) for a in actions])
 
 
 def rolling_rows(dataset, log, at: int, steps: int, batch: int = 1):
@@ -280,7 +280,7 @@ def test_a_rollback_in_one_slot_leaves_the_others_alone(singles, tmp_path):
     def one_of_three(observation):
         rows = attach_all(push_policy(observation), ControlColumns())
         if next(turn) == 9:
-            rows[1] = attach(rows[1:2, :2], ControlColumns(5))[0]
+            rows[1] = append_columns(rows[1:2, :2], ControlColumns(5))[0]
         return rows
 
     mixed = evaluate(

@@ -163,7 +163,7 @@ def run_policy(
             continue
         units = [WorkItem(u, u.trial) for u in wanted]
         protocol = EvalProtocol("recovery", 0, wanted[0].driver, seed, None)
-        run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, keep=keep)
+        run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, on_trial_end=keep)
         engine = open_engine(run, units, make_host, places)
         engine.run(units)
         engine.check_all_run()

@@ -111,15 +111,15 @@ def _solved(book: RolloutJournal, unit: RolloutSpec) -> bool:
 def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
     """Has the pool's slots made where the options say, drawing on that machine's own device; how many there
     may be."""
-    opening = WorkerStartup()
+    startup = WorkerStartup()
     if draws:
         from lerobot_roborecover.workers.render_device import egl_devices, node_drawing, render_environment
 
-        opening = WorkerStartup(partial(node_drawing, "auto"))
+        startup = WorkerStartup(partial(node_drawing, "auto"))
         if not options.workplace.on_cluster:
             pool.configure(environment=render_environment("auto", options.device or "cpu", egl_devices()))
-    return options.workplace.settle(
-        pool, options.slots, default_slots("cpu", usable_cores(), available_gb()), opening
+    return options.workplace.allocate_workers(
+        pool, options.slots, default_slots("cpu", usable_cores(), available_gb()), startup
     )
 
 

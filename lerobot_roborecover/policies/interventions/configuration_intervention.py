@@ -62,13 +62,13 @@ class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
     RoboTwin 60 for tasks with a horizon of 500 or more."""
     driver: str = ""
     """Who stands in for `human`: `package.module:function`, which returns an
-    `interventions.driver.Driver`."""
+    `policies.interventions.takeover.Driver`."""
     push_to_hub: bool = False
 
     counted_elsewhere: ClassVar[tuple[str, ...]] = (
         "base", "correction", "monitor", "mode", "correction_steps", "rewind_steps", "driver",
     )  # fmt: skip
-    """Fields that `env.facts.intervention_facts` says by content, in `TrialRow.options`."""
+    """Fields that `policies.metadata.intervention_facts` says by content, in `TrialRow.options`."""
 
     def check(self) -> None:
         """Refuses what cannot be used; not while parsing, where draccus would bury the message.

@@ -30,7 +30,7 @@ from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.interventions.members import MemberHost
 from lerobot_roborecover.policies.interventions.takeover import Driver
 from lerobot_roborecover.policies.runner import Chunk, PolicyError
-from lerobot_roborecover.workers.control_columns import BY_RULE, ControlColumns, Controller, attach
+from lerobot_roborecover.workers.control_columns import BY_RULE, ControlColumns, Controller, append_columns
 
 type Observation = Mapping[str, torch.Tensor]
 """After the env preprocessor, batch axis of 1."""
@@ -118,7 +118,7 @@ class InterventionController:
             episodes: their trials, updated here.
 
         Returns:
-            Arrays (n, A + 5), see `env.directives`; an error in place of each for which a member raised.
+            Arrays (n, A + 5), see `workers.control_columns`. Where a member raised, its error instead.
         """
         out: list[Chunk | PolicyError | None] = [None] * len(episodes)
         self._watch(observations, instructions, episodes, out)
@@ -193,7 +193,7 @@ class InterventionController:
             step_back = ControlColumns(
                 self._rollback, Controller.BASE, told.asked, told.score, told.monitor_s
             )
-            return attach(np.zeros((1, self._width), np.float32), step_back)
+            return append_columns(np.zeros((1, self._width), np.float32), step_back)
         taker = Controller.HUMAN if self._mode == "human" else Controller.CORRECTION
         self._hand_over(episode, taker)
         if taker is Controller.HUMAN:
@@ -254,7 +254,7 @@ class InterventionController:
             take = min(take, episode.left)
         if episode.pending and self._watcher is not None:
             take = 1
-        rows = attach(np.ascontiguousarray(queue[:take]), episode.first)
+        rows = append_columns(np.ascontiguousarray(queue[:take]), episode.first)
         episode.queue = queue[take:] if take < len(queue) else None
         episode.first = ControlColumns(controller=episode.controller)
         if episode.controller is Controller.CORRECTION:

@@ -33,7 +33,8 @@ from lerobot_roborecover.workers.control_columns import Controller
 class RoboRecoverInterventionPolicy(PreTrainedPolicy):
     """A base policy with interventions. Has no weights of its own: saved, it names its members.
 
-    Actions carry five columns more than the environment's (`env.directives`); its vector env takes them off.
+    Actions carry five columns more than the environment's (`workers.control_columns`). The vector env takes
+    them off.
     """
 
     # LeRobot declares both as None, for subclasses to replace.

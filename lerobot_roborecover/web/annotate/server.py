@@ -41,7 +41,7 @@ MAX_ADOPTED = 100
 """Votes of an earlier version's page that are asked about at once."""
 _PAGE = PageFiles(
     "lerobot_roborecover.web.annotate", "app.js", "drafts.js", "frames.js", "plots.js", "outbox.js",
-    "panel.js", "player.js", "readout.js", "guide.js", "keys.js", "kept.js", "storage.js",
+    "panel.js", "player.js", "readout.js", "guide.js", "keys.js", "unsentVotes.js", "storage.js",
 )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from lerobot_roborecover.web.teleop.protocol import VERSION, held_axes, parse
 
 NAME = "drive"
 """Of the address and of the cookie."""
-_PAGE = PageFiles("lerobot_roborecover.web.teleop", "app.js", "inputs.js", "link.js", "told.js")
+_PAGE = PageFiles("lerobot_roborecover.web.teleop", "app.js", "inputs.js", "link.js", "status.js")
 
 
 @dataclass(frozen=True)

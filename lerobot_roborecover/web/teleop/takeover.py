@@ -45,7 +45,7 @@ class TakeoverSlot:
 
 
 class Takeover:
-    """An `interventions.driver.Driver`.
+    """An `policies.interventions.takeover.Driver`.
 
     Args:
         port: of the page; 0 takes a free one.

@@ -3,7 +3,7 @@
 import { draftOf, Drafts } from "./drafts.js";
 import { Frames } from "./frames.js";
 import { element, fillGuide } from "./guide.js";
-import { Kept } from "./kept.js";
+import { UnsentVotes } from "./unsentVotes.js";
 import { listen } from "./keys.js";
 import { Outbox, post } from "./outbox.js";
 import { fillAbout, fillDiscussion, fillSuggestions } from "./panel.js";
@@ -349,7 +349,7 @@ async function start() {
     taken,
     refused,
   });
-  kept = new Kept($("kept"), session, outbox, drafts, (id) => {
+  kept = new UnsentVotes($("kept"), session, outbox, drafts, (id) => {
     progress();
     const shown = id || episode?.id;
     episode = id ? episode : null; // what it was drawn with is not what is kept now

@@ -3,7 +3,7 @@
 
 import { Inputs, isMotion } from "./inputs.js";
 import { Link } from "./link.js";
-import { at, advise, drawnScene, drew, showVeil, tellStatus } from "./told.js";
+import { at, advise, drawnScene, drew, showVeil, tellStatus } from "./status.js";
 
 const SPEEDS = [0.1, 0.2, 0.35, 0.5, 0.75, 1];
 const TYPES = ["Wrong Target", "Wrong Pose", "Stage Rollback", "Scene Change"];

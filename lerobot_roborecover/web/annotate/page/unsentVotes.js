@@ -9,7 +9,7 @@ import { elsewhere, kept, ofEarlierVersion } from "./storage.js";
 const ASKED_AT_ONCE = 100;
 const votesOf = (count) => `${count} vote${count === 1 ? "" : "s"}`;
 
-export class Kept {
+export class UnsentVotes {
   // holder: an element. opened(id): shows an episode of the queue.
   constructor(holder, session, outbox, drafts, opened) {
     Object.assign(this, { holder, session, outbox, drafts, opened, known: {} });
