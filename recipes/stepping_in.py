@@ -45,7 +45,7 @@ ARMS = (BASELINE, "reversion", "correction", *DETECTORS)
 
 @dataclass(frozen=True)
 class Subject:
-    """Whom to help, where, and by whose example."""
+    """The base policy, its platform, and the policies whose recoveries Correction learns from."""
 
     scenarios: str
     base: Path
