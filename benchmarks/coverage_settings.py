@@ -264,7 +264,7 @@ def tests(replicates: int) -> Iterator[Line]:
 
 
 def verdicts(successes: np.ndarray, most: int, error: float = 0.05) -> np.ndarray:
-    """(families, pairs) who is shown to be ahead: 1, -1, or 0 where nobody is.
+    """(families, pairs) which policy is shown to be ahead: 1, -1, or 0 for neither.
 
     Args:
         successes: (families, policies, units) int.

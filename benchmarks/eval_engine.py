@@ -85,7 +85,7 @@ def cpu_s() -> tuple[float, float]:
 
 
 def bare_rate(scenarios, config, chunk, args) -> float:
-    """Steps per second of workers that do what the trials did, with nobody in between."""
+    """Steps per second of workers that repeat the trials' steps without the engine."""
     slots = [WorkerSlot(config, 600.0) for _ in range(args.slots)]
     specs = [EpisodeSpec(s, "recovery", 0, False) for s in scenarios]
     for slot, spec in zip(slots, specs, strict=True):

@@ -5,8 +5,8 @@
 
 Both step the same environment class with the same actions from the same seed, in short turns one after the
 other, so that the machine's moods fall on both; printed is the median of the turns' ratios. The bare
-environment of Aloha draws three pictures a step, which the platform leaves out where nobody looks: there the
-ratio is that of what a replay costs.
+environment of Aloha draws three pictures a step, which the platform skips where no image is requested: there
+the ratio shows the cost of a replay.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
 
 Both take the same random actions from the same states, in short turns one after the other; their states are
 compared bit for bit at the end of each. Printed are CPU milliseconds of this thread, which other work on the
-machine moves less than the clock: medians over a task's turns, of `step`, `observe` (the state for policies
-without eyes) and `succeeded`, and of the turns' ratios.
+machine moves less than the clock: medians over a task's turns, of `step`, `observe` (the state
+observations) and `succeeded`, and of the turns' ratios.
 """
 
 from __future__ import annotations

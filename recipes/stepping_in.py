@@ -1,14 +1,16 @@
-"""Does stepping in help? A detector that has learned from forks when Correction pays, against letting the
-policy go on and against stepping in always, where nothing was learned (docs/stepping_in.md).
+"""Study of when to intervene: a detector learns from forks where Correction gains (docs/stepping_in.md).
+
+It is compared with never intervening and always intervening on scenarios that nothing was learned from.
 
     python -m recipes.stepping_in --platform libero --out outputs/stepping_in
     python -m recipes.stepping_in --platform metaworld --out outputs/stepping_in_metaworld
     python -m recipes.stepping_in --platform metaworld --out outputs/stored --stored
 
-The training scenarios are divided, by what they share, into three parts. On one, Correction is trained
-(`roborecover donors`, `lerobot-train`); on the next, the base's trials are forked with that Correction, and
-detectors fitted; on the third, their thresholds are set. Then every arm is run on the test scenarios, and
-reported. What is finished is skipped. `--store` keeps the outcomes with the code, `--stored` reports those.
+The training scenarios are divided, by what they share, into three parts. The first trains Correction
+(`roborecover donors`, `lerobot-train`). On the second, the base's trials are forked with that Correction, and
+detectors are fitted. The third sets their thresholds. Then every arm runs on the test scenarios, and the
+report is written. Finished parts are skipped. `--store` keeps the outcomes with the code, `--stored` reports
+those.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ ARMS = (BASELINE, "reversion", "correction", *DETECTORS)
 
 @dataclass(frozen=True)
 class Subject:
-    """Whom to help, where, and by whose example."""
+    """The base policy, its platform, and the policies whose recoveries Correction learns from."""
 
     scenarios: str
     base: Path

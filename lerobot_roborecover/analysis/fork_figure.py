@@ -76,4 +76,4 @@ def gain_by_step(gains: ForkGains) -> Figure:
     }
     words = "; ".join(f"{arm} {number(100 * v, '+.1f')} at step {s}" for arm, (s, v) in best.items())
     text = f"Recovery gain against the step of the intervention. Largest, all cells together: {words}."
-    return Figure("fork_gain", "When stepping in pays", text, *both(draw))
+    return Figure("fork_gain", "Gain by intervention timing", text, *both(draw))

@@ -1,4 +1,4 @@
-"""What stepping in gains, from the rows of forks: P(success | intervene) - P(success | continue).
+"""Computes the gain of an intervention from forks: P(success | intervene) - P(success | continue).
 
 Every fork of an arm is compared with the continuation from the same step of the same logged trial on the
 same random stream. A scenario's number is the mean of its differences, whatever the number of its forks;

@@ -1,4 +1,4 @@
-"""The result of a report in a few sentences: who is ranked first, how surely, and from whom it is told."""
+"""Summarizes a report in a few sentences: the best policy, how certain, and what it is separated from."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _who(results: Results) -> str:
 
 
 def _standing(best: str, found: list[Contrast]) -> str:
-    """From whom the first is separated, and from whom not."""
+    """Lists the policies that the first is separated from, and those that it is not."""
     few = [c.b for c in found if c.verdict is ComparisonVerdict.TOO_FEW]
     barred = [c.b for c in found if c.barred is not None]
     level = [c.b for c in found if not c.verdict.separated and c.b not in (*few, *barred)]

@@ -166,7 +166,7 @@ def resolve(candidates: CandidateSet, folder: Path, config: ResolutionConfig) ->
                     if candidate in blind:
                         blind[candidate].append(vote)
         for candidate, votes in in_round.items():
-            # A discussion counts once everybody has voted again; until then the round before stands.
+            # A discussion counts once all annotators have voted again; until then the previous round counts.
             if candidate in latest and (number == 1 or len(votes) >= config.annotators):
                 latest[candidate] = votes
                 rounds = max(rounds, number)

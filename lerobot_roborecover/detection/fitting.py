@@ -145,7 +145,7 @@ def fit_features(
 def fit_gain(
     detector: RoboRecoverRecoveryGainRewardModel, forks: Sequence[SeenForks], looks: PolicySignals
 ) -> str:
-    """Fits it to what stepping in gained where trials were forked.
+    """Fits the detector to the gains of interventions in forked trials.
 
     Args:
         detector: not fitted yet.
@@ -156,7 +156,7 @@ def fit_gain(
         What it was fitted to, in words.
 
     Raises:
-        MonitorError: stepping in rescued nowhere.
+        MonitorError: the intervention rescued no trial.
     """
     features, gains = [], []
     for forked in forks:

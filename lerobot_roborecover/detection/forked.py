@@ -1,4 +1,4 @@
-"""Logged trials that were forked, and what stepping in gained at each fork: what `recovery_gain` learns."""
+"""Forked trials with the gain of the intervention at each fork: training data of `recovery_gain`."""
 
 from __future__ import annotations
 

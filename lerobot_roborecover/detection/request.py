@@ -81,7 +81,7 @@ class DetectionRequest:
 
 @dataclass(frozen=True)
 class Detection:
-    """What came out."""
+    """Results of a detector comparison."""
 
     measured: list[MeasuredDetector]
     trials: list[ReplayedTrial]

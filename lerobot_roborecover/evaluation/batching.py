@@ -27,10 +27,10 @@ _SIMULATIONS = 64
 
 
 class BatchTimer:
-    """Of one replica of the policy.
+    """Times the batches of one replica of the policy.
 
     Args:
-        least_s: how long a waiting trial may wait for company at least.
+        least_s: minimum time in seconds that a waiting trial waits for others.
     """
 
     def __init__(self, least_s: float):
@@ -40,18 +40,18 @@ class BatchTimer:
         self._simulations = deque[tuple[int, float]](maxlen=_SIMULATIONS)
 
     def inferred(self, batch: int, seconds: float) -> None:
-        """An inference for so many observations took so long."""
+        """Records the time of an inference for a batch of observations."""
         self._inferences.append(seconds)
         self._by_size.setdefault(batch, deque(maxlen=_RECENT)).append(seconds)
 
     def simulated(self, together: int, seconds: float) -> None:
-        """A simulator took so long to execute an answer, while those of so many trials began at once."""
+        """Records how long a simulator took to execute an answer, and how many trials began at once."""
         self._simulations.append((together, seconds))
 
     def ask_at(
         self, waiting: Sequence[float], acting: Sequence[float], handing_off: int, limit: int
     ) -> float:
-        """When the replica is to be asked at the latest, on the engine's clock.
+        """Returns when to send the batch at the latest, on the engine's clock.
 
         Args:
             waiting: since when each trial waits; at least one.
@@ -75,20 +75,24 @@ class BatchTimer:
 
     @property
     def delay_s(self) -> float:
-        """How long a trial waits for half of all."""
+        """How long a trial waits for half of the trials."""
         # The shortest of the last inferences: the first ones compile.
         usual_s = min(self._inferences, default=0.0)
         return max(self._least_s, min(PATIENCE * usual_s, _MOST_PATIENT_S))
 
     def _simulation_s(self, everybody: int) -> float | None:
-        """From an answer to the next question, of nine in ten trials, were so many answered at once: where
-        fewer were, cores may have been free that these would have to share."""
+        """Returns the 90th percentile of the simulation time, if `everybody` trials step at once.
+
+        Times of fewer trials are scaled up, because more trials have to share the cores.
+        """
         times = [seconds * max(1.0, everybody / together) for together, seconds in self._simulations]
         return quantiles(times, n=10)[-1] if len(times) > 1 else None
 
     def _fixed_s(self) -> float:
-        """What an inference takes however few it is for. Before batches of different sizes have shown it, all
-        of the shortest: to ask about all together once will show it."""
+        """Returns the fixed time of an inference, which does not depend on the batch size.
+
+        Until batches of different sizes have been measured, this is the time of the shortest inference.
+        """
         shortest = {size: min(times) for size, times in self._by_size.items() if len(times) > 1}
         if not shortest or max(shortest) < _SPREAD * min(shortest):
             return min(self._inferences, default=0.0)

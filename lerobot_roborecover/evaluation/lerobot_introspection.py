@@ -1,9 +1,9 @@
-"""The configuration of a running `lerobot-eval`, which LeRobot 0.6.1 does not hand on to environments.
+"""Reads the configuration of a running `lerobot-eval`, which LeRobot 0.6.1 does not pass to environments.
 
-LeRobot makes an env from its `EnvConfig` and a batch size alone. The trial log has to say who is evaluated,
-and a batch that does not divide the trials has to be refused before a simulator starts. LeRobot's own script
-holds the whole configuration, parsed, in a variable while it makes the env. That one is read: no command line
-is parsed a second time and nothing of LeRobot's is changed. Any other caller leaves the defaults.
+LeRobot makes an env from its `EnvConfig` and a batch size alone. But the trial log must name the evaluated
+policy, and a batch size that does not divide the trials must be refused before a simulator starts. LeRobot's
+script holds the parsed configuration in a local variable while it makes the env; this module reads that
+variable. It parses no command line again and changes nothing in LeRobot. Other callers get the defaults.
 """
 
 from __future__ import annotations

@@ -109,8 +109,8 @@ def _load_host(spec: HostSpec) -> PolicyRunner:
 
 
 def _check_trained(config: PreTrainedConfig, policy: Any) -> None:
-    """Refuses random weights of any policy type. `policies.metadata.check_trained` refuses LeRobot's own types
-    sooner."""
+    """Refuses random weights of any policy type. `policies.metadata.check_trained` refuses LeRobot's own
+    types sooner."""
     if config.pretrained_path or isinstance(config, NotTrained):
         return
     if any(parameter.requires_grad for parameter in policy.parameters()):

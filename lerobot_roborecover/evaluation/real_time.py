@@ -1,15 +1,15 @@
-"""A clock that does not stop: what the robot does while its policy thinks, in control steps.
+"""Real-time evaluation: charges inference time in control steps.
 
-The paper's clock is frozen: a policy may think as long as it likes about a scene that waits for it. With
-`--env.realtime=true` an inference of L seconds costs ceil(L x control rate) steps of the trial. Meanwhile, as
-`--env.meanwhile` says,
+The paper's clock is frozen: the scene waits during an inference. With `--env.realtime=true` an inference of L
+seconds costs ceil(L x control rate) steps of the trial. `--env.meanwhile` selects what the robot does then:
 
-- `hold`: the last action is repeated, and the new chunk follows it;
-- `chunk`: the rest of the last chunk goes on. The policy is asked again so many steps before a chunk's end as
-  its last inference took; of the new chunk, the actions whose time has passed are dropped.
+- `hold`: it repeats the last action; the new chunk follows.
+- `chunk`: it continues the last chunk. The next inference starts before the chunk ends, as many steps as the
+  last inference took. Actions of the new chunk whose time has passed are dropped.
 
-Nothing is charged before a trial's first action: there is none yet to go on with. An inference is an answer
-that begins a new chunk: with n actions an inference, every n-th action of the policy. Pure: no clock.
+Nothing is charged before a trial's first action, because there is no action to continue. An inference is an
+answer that begins a new chunk: with n actions an inference, every n-th action of the policy. Nothing here
+reads a clock.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lerobot_roborecover.errors import OptionError
 
 MEANWHILE = ("hold", "chunk")
 _TINY = 1e-6
-"""Of a step: 0.15 s at 20 a second are three steps, whatever floating point makes of it."""
+"""Tolerance in steps for rounding errors: 0.15 s at 20 steps a second must give three steps."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RealTime:
     """n: the policy's actions an inference."""
 
     def decisive(self) -> Mapping[str, object]:
-        """What a trial row says of it."""
+        """Returns the settings for the trial row."""
         return {
             "realtime": self.meanwhile,
             "latency_s": "measured" if self.latency_s is None else self.latency_s,

@@ -39,28 +39,28 @@ from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
 MAX_CONSECUTIVE_FAILURES = 3
 """Simulator failures of one scenario in a row after which its other trials are not tried."""
 _POLL_S = 0.5
-"""How often `stop` is asked at least."""
+"""Longest time between two calls of `stop`, seconds."""
 
 type Waiter = Callable[[list[Any], float], Collection[Any]]
-"""Waits for any of some handles, at most so many seconds; those that are ready."""
+"""Waits for any of the handles, at most the given seconds; returns those that are ready."""
 type Event = tuple[Replica | SimulatorWorker, Callable[[], None]]
-"""Whom to wait for, and what to do then."""
+"""A connection to wait for, and the action when it is ready."""
 
 
 class Engine:
-    """Runs units on slots.
+    """Runs trials on slots.
 
     Args:
-        run: protocol (with its run seed), trial log.
-        slots: where simulators live.
-        replicas: the policies.
-        wait: how to wait for slots and replicas.
-        batch_delay_s: how long a waiting slot may wait for company before the policy is asked, at least;
-            where inferences are slow it is longer, see `company`.
+        run: protocol (with its run seed) and trial log.
+        slots: slots, each with a simulator.
+        replicas: copies of the policy.
+        wait: waits for events of slots and replicas.
+        batch_delay_s: minimum time that a waiting slot waits for others before the policy infers; longer
+            where inferences are slow, see `batching`.
         on_row: called with every finished trial.
-        videos: which trials to film, if any.
-        queue_of: in which order units are handed out.
-        clock: seconds, the one that slots' deadlines are on.
+        videos: trials to record videos of, if any.
+        queue_of: order of the trials.
+        clock: returns seconds; slots' deadlines use the same clock.
     """
 
     def __init__(
@@ -87,18 +87,18 @@ class Engine:
         self._queue = WorkQueue(())
         self._finished = 0
         self.reruns = 0
-        """Trials that were begun again because a machine was lost, or the policy, or the way to it."""
+        """Trials that were restarted because a machine, the policy, or the connection to it was lost."""
         self._stop: Callable[[], bool] = lambda: False
         self.unrun: dict[tuple[str, int], str] = {}
         """Why trials were left for another run, by scenario and trial: the policy could not be reached, or an
         inference never ended."""
 
     def run(self, units: Sequence[WorkItem[TrialStart]], stop: Callable[[], bool] = lambda: False) -> int:
-        """Runs all units that the log does not hold yet.
+        """Runs all trials that the log does not hold yet.
 
         Args:
-            units: what to run.
-            stop: asked between events; True starts no new trial and drops those under way.
+            units: trials to run.
+            stop: called between events; True starts no new trial and drops the running ones.
 
         Returns:
             Number of trials finished.
@@ -224,7 +224,7 @@ class Engine:
         arrived = []
         if others:
             arrived = self._arrived(others, 0.0 if inline else timeout_s)
-        for _, act in arrived or inline:  # an inference in this process holds everyone up: replies come first
+        for _, act in arrived or inline:  # an inference in this process blocks all slots: replies come first
             act()
         return bool(arrived or inline)
 

@@ -46,7 +46,7 @@ class Reference:
     """How many a scenario has; each number that occurs."""
 
     def outcomes(self) -> str:
-        """SHA-256 of its rates: a log that grows between two looks would change what has counted."""
+        """Returns a SHA-256 of its rates, so that a changed log is detected at a later look."""
         text = "\n".join(f"{name} {rate!r}" for name, rate in sorted(self.rates.items()))
         return hashlib.sha256(text.encode()).hexdigest()
 

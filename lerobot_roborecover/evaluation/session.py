@@ -75,9 +75,9 @@ class EvalSession:
     real_time: RealTime | None = None
     """None where the simulator waits for the policy."""
     policy_watchdog_s: float = POLICY_WATCHDOG_S
-    """Longest that one inference may take; infinite where it may take for ever."""
+    """Longest time of one inference in seconds; infinite for no limit."""
     on_trial_end: Callable[[Trial, TrialRow], None] = lambda trial, row: None
-    """Called when a trial ends, before its row is written: what it saves exists for every row."""
+    """Called when a trial ends, before its row is written."""
 
     def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
@@ -85,11 +85,11 @@ class EvalSession:
         return platform_named(scenario.platform).policy_action_width(options, scenario.prefix.shape[1])
 
     def rollback_steps(self, scenario: TrialStart) -> int:
-        """How far back the policy may ask to go."""
+        """Returns the most steps that a rollback may be requested for."""
         return self.intervention.rollback_steps(scenario) if self.intervention else 0
 
     def require_log(self) -> RowLog:
-        """The log of a run that has one, as every run of `create_session` does.
+        """Returns the log; every run of `create_session` has one.
 
         Raises:
             RuntimeError: it has none.
@@ -99,13 +99,13 @@ class EvalSession:
         return self.log
 
     def retry(self, outcomes: Sequence[str]) -> tuple[int, Path]:
-        """Takes the log's trials of these outcomes out, so that they run again.
+        """Removes the log's trials with these outcomes, so that they run again.
 
         Args:
-            outcomes: invalid ones.
+            outcomes: invalid outcomes.
 
         Returns:
-            How many they are, and the file beside the log that keeps their rows.
+            The number of removed trials, and the file beside the log that keeps their rows.
         """
         log = self.require_log()
         beside = log.path.with_name(f"{log.path.name}.retried.jsonl")
@@ -119,12 +119,12 @@ class EvalSession:
         return [] if self.log is None else [r for r in self.log.rows if r.config_hash == config_hash]
 
     def keys(self, trials: Sequence[tuple[TrialStart, int]]) -> list[tuple]:
-        """What the log knows trials by: scenarios, and k."""
+        """Returns the log's keys of trials, given as scenario and k."""
         hash_ = self.protocol.config_hash()
         return [trial_key(scenario.sha256(), scenario.id, hash_, k) for scenario, k in trials]
 
     def trial(self, scenario: TrialStart, index: int, protocol: EvalProtocol | None = None) -> Trial:
-        """A trial of the run, not begun.
+        """Makes a trial of the run, not started yet.
 
         Args:
             scenario: one of the run's.

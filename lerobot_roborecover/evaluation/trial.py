@@ -60,18 +60,18 @@ FAILURES = {
     "hung": Outcome.TIMEOUT,
     "lost": Outcome.SIM_ERROR,
 }
-"""What a slot's failure makes of its trial, by kind; one that is `lost` is tried elsewhere first."""
+"""Outcome of a trial by the kind of its slot's failure; a `lost` trial is first run again elsewhere."""
 
 
 class TrialState(StrEnum):
-    """Where a trial is."""
+    """State of a trial."""
 
     NEW = "new"
     """No request has been sent yet."""
     HANDING_OFF = "handing_off"
     """A simulator rebuilds its start."""
     WAITING = "waiting"
-    """It has an observation that the policy has not been asked about."""
+    """It has an observation that the policy has not received yet."""
     ASKED = "asked"
     """The policy infers."""
     ACTING = "acting"
@@ -88,38 +88,38 @@ IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK
 
 @dataclass(frozen=True)
 class Act:
-    """A decision: execute these."""
+    """A decision to execute actions."""
 
     actions: np.ndarray
-    """(n, A), all of them fit to be sent."""
+    """(n, A), checked."""
 
 
 @dataclass(frozen=True)
 class RollbackRequest:
-    """A decision: put the simulation back instead of acting."""
+    """A decision to roll the simulation back instead of acting."""
 
     steps: int
     """How many; `control_columns.BY_RULE` for the platform's number."""
 
 
 class PolicyStateFactory(Interface):
-    """What keeps a policy's histories (`policies.host`)."""
+    """Creates a policy's history for a trial (`policies.runner`)."""
 
     def start(self, seed: int | None) -> Any:
-        """Fresh history for a trial of that seed."""
+        """Returns fresh history for a trial with this seed."""
 
 
 class Trial:
-    """One policy on one scenario, once.
+    """One trial of one policy on one scenario.
 
     Args:
-        scenario: what is rebuilt.
-        index: k, of the trial within its scenario, from 0.
-        protocol: what the run holds fixed.
+        scenario: the start to rebuild.
+        index: k, number of the trial within its scenario, from 0.
+        protocol: settings that are fixed for the run.
         action_width: A, values in the policy's action.
         handoff_check: compare the handoff with the scenario's fingerprint.
-        rollback_steps: how far back the policy may ask to go.
-        real_time: what an inference costs; None: the simulator waits.
+        rollback_steps: most steps that a rollback may be requested for.
+        real_time: cost of an inference in steps; None: the simulator waits during inferences.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Everything about a simulator family that is not physics; what is above knows platforms only through this.
+"""Platform interface: everything about a simulator family but the physics. Other code uses only this.
 
 A platform is one subclass of `Platform` and one `Simulator`. Ours lie in the folders beside this file; those
 of other distributions are found through the entry-point group `roborecover.platforms` (docs/platforms.md).
@@ -47,7 +47,7 @@ class Expert:
 
 @dataclass(frozen=True)
 class SimulatorSetup:
-    """What a checked env config asks of the platform's simulator, and what of it decides results."""
+    """Simulator options from a checked env config, and those of them that decide results."""
 
     options: Mapping[str, Any]
     """Keyword options of the simulator; plain JSON values, because they travel to worker processes."""
@@ -62,7 +62,7 @@ class SimulatorSetup:
     approximate_snapshots: bool = False
     """Use snapshots also where what follows them drifts from a replay."""
     platform: str = ""
-    """Which one, where the env type serves several."""
+    """Name of the platform, where the env type serves several."""
 
 
 class VideoEnvMixin:
@@ -82,7 +82,7 @@ class Platform:
     name: ClassVar[str]
     """Lower-case; the env type is `roborecover_<name>`, the Gymnasium id `roborecover/<Name>-v0`."""
     title: ClassVar[str]
-    """For people, e.g. `LIBERO`."""
+    """Display name, e.g. `LIBERO`."""
     action_widths: ClassVar[tuple[int, ...]]
     """Values in a recorded action; more than one where the platform has several kinds of actions."""
     control_hz: ClassVar[float]
@@ -90,7 +90,7 @@ class Platform:
     action_bound: ClassVar[float] = 1.0
     """Largest |value| of an action that the simulator does not cut; infinite for joint targets."""
     action_names: ClassVar[Mapping[int, tuple[str, ...]]] = {}
-    """By action width: what each value is, for people; names that end with `gripper` command grippers."""
+    """Display names of an action's values by action width; names that end with `gripper` command grippers."""
     gripper_commands: ClassVar[tuple[float, float]] = (-1.0, 1.0)
     """Values of a gripper's command that open and close it."""
     axis_angle: ClassVar[Mapping[int, tuple[int, ...]]] = {}
@@ -286,19 +286,19 @@ class Platform:
         return self.first_reset(task, seed=number)
 
     def random_actions(self, rng: np.random.Generator, steps: int, width: int) -> np.ndarray:
-        """(steps, width) float64 that move the robot about without harm, for `check-platform`."""
+        """Returns (steps, width) float64 harmless actions for `check-platform`."""
         return rng.uniform(-1.0, 1.0, (steps, width)) * min(self.action_bound, 1.0)
 
     def no_op(self) -> np.ndarray:
-        """(A,) float64 that keeps the robot where it is while the scene settles."""
+        """Returns the (A,) float64 action that keeps the robot still while the scene settles."""
         return np.zeros(self.action_widths[0])
 
     def unsupported_reason(self, task: Task) -> str:
-        """Why the scripted drivers cannot do a task at all; empty where they can try."""
+        """Returns why the scripted drivers cannot do a task; empty where they can try."""
         return ""
 
     def short_name(self, task: Task) -> str:
-        """Of a task, for the ids of its rollouts."""
+        """Returns a short task name for the ids of its rollouts."""
         return task.name
 
     # --- simulator and observations
@@ -323,7 +323,7 @@ class Platform:
         return cls(**options)
 
     def evaluated(self, scenarios: str, split: str | None) -> tuple[str, str | None]:
-        """The set and the split that are meant: as given, or the default set, of which the default split.
+        """Returns the scenario set and split: as given, or the default set and its default split.
 
         Raises:
             OptionError: none is given, and there is no default.
@@ -391,7 +391,7 @@ class Platform:
     # --- people
 
     def controls(self) -> Controls:
-        """How a person drives it.
+        """Returns the teleoperation controls.
 
         Raises:
             ScenarioError: it cannot be driven by hand; says why.
@@ -419,7 +419,7 @@ class Platform:
         return []
 
     def environment_fingerprint(self, options: Mapping[str, Any]) -> dict[str, str | None]:
-        """What else of this machine decides a replay: folders of assets, named by options or environment."""
+        """Returns other inputs that decide a replay: asset folders from options or environment variables."""
         return {}
 
     def __repr__(self) -> str:

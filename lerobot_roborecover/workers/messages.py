@@ -1,6 +1,6 @@
-"""What the parent asks of a slot and what comes back; plain data, so that it travels to a worker process.
+"""Messages between the parent and a slot: plain data that is sent to a worker process.
 
-On the wire there are a `SlotConfig` first, then `Command`s, and one reply to each of these.
+The parent sends a `SlotConfig` first, then `Command`s; the slot replies once to each of these.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Server(Protocol):
 
 @dataclass(frozen=True)
 class Command:
-    """One thing to do; the slot replies once, with a `SlotFailure` where it cannot."""
+    """A request to a slot, which replies once; with a `SlotFailure` where the request fails."""
 
     name: str
     argument: object = None
@@ -65,7 +65,7 @@ class Command:
 
 @dataclass(frozen=True)
 class InProgress:
-    """Reply in place of a result: it is under way; the same command without an argument goes on with it."""
+    """Reply before the result: the command is running; send it again without an argument to continue."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class EpisodeSpec:
     filmed: bool = False
     """Whether replies to `reset` and `act` bring a frame of every step, for a video."""
     rollback_steps: int = 0
-    """How far back a rollback may be asked for: snapshots of as many steps are kept, where they are exact."""
+    """Most steps of a rollback: snapshots of as many steps are kept, where they are exact."""
     played: np.ndarray | None = None
     """(n, A) actions of a fork's parent, in their own type: executed after the handoff and before the first
     observation."""
@@ -115,7 +115,7 @@ class StepResult:
 
 @dataclass(frozen=True)
 class ActResult:
-    """Reply to `act`: several actions executed without looking in between."""
+    """Reply to `act`: several actions were executed without observations in between."""
 
     observation: dict[str, Any] | None
     """After the last action; None once the trial is over, when it is not needed."""

@@ -1,7 +1,7 @@
-"""Slots: where simulators live. A worker slot is a process of its own, an inline slot runs in the caller's.
+"""Slots run simulators: a worker slot in a process of its own, an inline slot in the caller's process.
 
 A slot takes one command at a time: `send`, then `receive`. Between the two the caller may send to other
-slots, so that simulators of a batch run at the same time.
+slots, so that the simulators of a batch run in parallel.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotCon
 from lerobot_roborecover.workers.transport import Channel, make_memory
 
 MAX_ATTEMPTS = 3
-"""How often one thing may be lost with the machine that it was done on, before it is taken for the cause."""
+"""Attempts of an item whose machine is lost; after these the item counts as the cause."""
 _LOG_TAIL_BYTES = 600
 _START_S = 60.0
-"""What a fresh worker may take to import its simulator, on top of the watchdog's limit for its first
+"""Time a fresh worker may take to import its simulator, added to the watchdog's limit for its first
 command."""
 
 
 class Slot(Protocol):
-    """A place where one trial at a time runs."""
+    """Runs one trial at a time."""
 
     def send(self, command: str, argument: object = None) -> None:
         """Starts a command."""

@@ -90,6 +90,6 @@ def test_tables_and_page(tmp_path):
     assert tables[2].sparse
     assert gain_tables(fork_gains(rows)) == tables
     page = (tmp_path / "gain.html").read_text()
-    assert "When stepping in pays" in page
+    assert "Gain by intervention timing" in page
     assert "roborecover fork …" in page
     assert (tmp_path / "fork_gain.svg").read_bytes().startswith(b"<?xml")

@@ -1,4 +1,4 @@
-"""Time that goes on while the policy thinks: what is executed meanwhile, and that both loops agree on it."""
+"""Real-time evaluation: what is executed during inference, and that both loops agree on it."""
 
 from __future__ import annotations
 

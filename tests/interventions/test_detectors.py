@@ -247,7 +247,7 @@ def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
     again = load(str(tmp_path))
     np.testing.assert_array_equal(again.judge_windows(asked).scores, said.scores)
     assert (again.config.threshold, again.least_threshold) == (0.0, 0.0)
-    with pytest.raises(MonitorError, match="of 3 forks stepping in rescued none"):
+    with pytest.raises(MonitorError, match="of 3 forks the intervention rescued none"):
         load("recovery_gain").fit(features[:3], -torch.ones(3))
 
 

@@ -94,7 +94,7 @@ def take_vote(book: VoteJournal, candidates: CandidateSet, candidate: str, sent:
     Args:
         book: the annotator's.
         candidates: the dataset.
-        candidate: id of whom it is about, whatever `sent` calls it.
+        candidate: the candidate's id, which `sent` may name differently.
         sent: see `parse_vote`.
 
     Raises:

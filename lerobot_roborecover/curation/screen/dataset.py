@@ -43,7 +43,7 @@ SCREENING_FILE = "screening.json"
 
 @dataclass(frozen=True)
 class ScreenRequest:
-    """What to screen, with whom and how."""
+    """What to screen, with which policies and how."""
 
     dataset: str
     """Folder, Hub id or shipped name of the scenario set."""

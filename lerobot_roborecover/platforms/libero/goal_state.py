@@ -1,4 +1,4 @@
-"""`observation.environment_state` on LIBERO: what a policy without eyes has to know, in 77 numbers.
+"""`observation.environment_state` on LIBERO: the state observation of 77 numbers.
 
 The same numbers mean the same in all forty tasks: the hand, the pending goal (the first that is not reached),
 what is to be moved for it, where that belongs, the drawer, door or knob that plays a part, the goal after it,

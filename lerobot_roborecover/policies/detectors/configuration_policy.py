@@ -63,7 +63,7 @@ class RoboRecoverPolicyFeaturesConfig(FeatureNetworkConfig):
 @RewardModelConfig.register_subclass("roborecover_recovery_gain")
 @dataclass
 class RoboRecoverRecoveryGainConfig(FeatureNetworkConfig):
-    """What stepping in now would gain, P(success | intervene) - P(success | continue), fitted to forks."""
+    """Gain of an intervention now, P(success | intervene) - P(success | continue), fitted to forks."""
 
     threshold: float | None = 0.0
     """Gain above which it asks for help; `roborecover eval-monitor` never sets less than 0."""

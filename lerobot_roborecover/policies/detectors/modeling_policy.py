@@ -190,7 +190,7 @@ class RoboRecoverPolicyFeaturesRewardModel(FeatureNetwork):
 
 
 class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
-    """What stepping in now is expected to gain over going on: from -1, it harms, to 1, it rescues."""
+    """Predicts the expected gain of an intervention now: from -1 (harms) to 1 (rescues)."""
 
     config_class = RoboRecoverRecoveryGainConfig
     name = "roborecover_recovery_gain"
@@ -207,13 +207,13 @@ class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
             The last hundred steps' mean loss.
 
         Raises:
-            MonitorError: stepping in changed nothing anywhere.
+            MonitorError: the intervention rescued no trial.
         """
         counts = {"rescued": gains > 0, "harmed": gains < 0, "alike": gains == 0}
         self.config.labels = {name: int(rows.sum()) for name, rows in counts.items()}
         if not self.config.labels["rescued"]:
             raise MonitorError(
-                f"recovery_gain: of {len(gains)} forks stepping in rescued none "
+                f"recovery_gain: of {len(gains)} forks the intervention rescued none "
                 f"({self.config.labels['harmed']} harmed), so there is no gain to learn. Fork more trials "
                 "(roborecover fork --every), or with another --arm"
             )

@@ -38,14 +38,14 @@ type Observation = Mapping[str, torch.Tensor]
 
 @dataclass(eq=False)
 class InterventionState:
-    """One trial, as the composite policy sees it."""
+    """State of one trial in the composite policy."""
 
     seed: int | None
     pending: bool
     """An intervention may still come."""
     controller: Controller = Controller.BASE
     history: Any = None
-    """The acting policy's, or what the driver calls the slot."""
+    """History of the acting policy, or the driver's name of the slot."""
     stream: list[torch.Tensor] | None = None
     """The trial's random stream, while no policy has it."""
     queue: np.ndarray | None = None
@@ -53,16 +53,16 @@ class InterventionState:
     left: int = 0
     """Steps that the correction policy still has."""
     first: ControlColumns = field(default_factory=ControlColumns)
-    """What is to stand beside the next action."""
+    """Control columns of the next action."""
     watch: DetectorHistory | None = None
-    """What the monitor has seen of it; None without one."""
+    """The monitor's history of the trial; None without a monitor."""
 
 
 class InterventionController:
-    """Members, and what is to happen when.
+    """Runs the member policies and switches between them.
 
     Args:
-        members: the policies, by who they act as; `Controller.BASE` is among them.
+        members: the policies by controller; includes `Controller.BASE`.
         mode: of the composite policy.
         monitor: a monitor or any other detector, which decides when; None intervenes at the recovery point.
         probe: into the base policy, for a detector that looks into it.
@@ -90,7 +90,7 @@ class InterventionController:
         self._width = self.members[Controller.BASE].action_width
 
     def start(self, seed: int | None) -> InterventionState:
-        """A trial, with the base policy in charge.
+        """Starts a trial under the base policy.
 
         Args:
             seed: the trial's; None where the run has none, or where torch's own generator is seeded for it.
@@ -101,7 +101,7 @@ class InterventionController:
         return episode
 
     def finish(self, episode: InterventionState) -> None:
-        """Gives back what a trial held."""
+        """Releases what a trial holds."""
         self._leave(episode)
 
     def act(
@@ -110,7 +110,7 @@ class InterventionController:
         instructions: Sequence[str],
         episodes: Sequence[InterventionState],
     ) -> list[Chunk | PolicyError]:
-        """Actions with directives for slots that have none left to execute.
+        """Returns actions with control columns for slots that have no action left to execute.
 
         Args:
             observations: of each slot.

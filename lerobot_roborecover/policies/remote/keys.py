@@ -38,7 +38,7 @@ def api_key() -> str | None:
         return None
     if not key.strip():
         raise RemoteError(
-            f"{API_KEY} is set and empty, which would let everybody in: give it a value, or unset it"
+            f"{API_KEY} is set and empty, which would admit every client: give it a value, or unset it"
         )
     if key != key.strip() or not key.isascii() or not key.isprintable():
         raise RemoteError(f"{API_KEY} holds spaces at its ends, or what is not printable ASCII")

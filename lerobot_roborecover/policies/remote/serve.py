@@ -52,7 +52,7 @@ class ServeConfig:
     keyfile: str = ""
     """Its private key, PEM."""
     insecure: bool = False
-    """Let everybody who reaches --host use the policy, without a key."""
+    """Let every client that reaches --host use the policy, without a key."""
     rename_map: dict[str, str] = field(default_factory=dict)
     """The client's observation keys to the policy's, as in `lerobot-eval`."""
 

@@ -48,7 +48,7 @@ class ServeOptions:
     max_pending_bytes: int = 256 * 2**20
     """Of requests that have arrived and are not answered yet, over all connections."""
     api_key: str | None = None
-    """Clients must send it; None lets everybody in."""
+    """Key that clients must send; None admits every client."""
     certfile: str = ""
     """TLS certificate chain, PEM; empty serves without TLS."""
     keyfile: str = ""
@@ -288,7 +288,7 @@ class PolicyServer:
         try:
             if isinstance(message, str):
                 raise RequestError("a text frame; requests are binary frames of msgpack")
-            # Not in the event loop: a large frame would keep everybody else waiting.
+            # Not in the event loop: a large frame would block the other clients.
             content = await asyncio.to_thread(unpack, message, "the request")
             if not isinstance(content, dict):
                 raise RequestError(f"a request is a map, not a {type(content).__name__}")

@@ -36,19 +36,19 @@ def steps_per_picture(rate_hz: float, fps: float) -> int:
 
 
 def most_unseen(rate_hz: float, fps: float) -> int:
-    """How many steps may be taken that the driver has not seen: while one picture is on the screen and the
-    next one on its way, those of two."""
+    """Returns how many steps the driver may not have seen yet: those of two images, because one is on the
+    screen and the next is on its way."""
     return 2 * steps_per_picture(rate_hz, fps)
 
 
 @dataclass(frozen=True)
 class OperatorCommand:
-    """Something that is asked for, other than held inputs."""
+    """A command of the operator, other than held inputs."""
 
     kind: str
     values: dict[str, Any]
     reply: Reply
-    """Takes the answer; from any thread."""
+    """Sends the answer; callable from any thread."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class HeldInput:
-    """What one device holds."""
+    """Held input of one device."""
 
     axes: tuple[float, ...] = (0.0,) * len(AXES)
     wait: bool = False

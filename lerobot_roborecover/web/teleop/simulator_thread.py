@@ -37,7 +37,7 @@ from lerobot_roborecover.web.teleop.store import Store, read_recording
 _LOG = logging.getLogger(__name__)
 _IDLE_S = 0.5
 _SOON_S = 0.01
-"""How long a picture that was asked for waits for the commands before it, at most."""
+"""Longest time that a requested image waits for the commands before it, seconds."""
 _TOLD_EVERY_S = 0.5
 
 
@@ -96,7 +96,7 @@ class SimulatorThread(threading.Thread):
         self._broken = ""
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Runs until `stop`."""
         try:
             simulator = self._make()
             self._session = TeleopSession(simulator, self._operator)
@@ -115,7 +115,7 @@ class SimulatorThread(threading.Thread):
             simulator.close()
 
     def stop(self) -> None:
-        """Ends the thread after what it is doing."""
+        """Ends the thread after its current command."""
         self._stopped.set()
         self.pilot.command(OperatorCommand("status", {}, lambda _answer: None))
 
