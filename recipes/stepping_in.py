@@ -6,7 +6,7 @@ policy go on and against stepping in always, where nothing was learned (docs/ste
     python -m recipes.stepping_in --platform metaworld --out outputs/stored --stored
 
 The training scenarios are divided, by what they share, into three parts. On one, Correction is trained
-(`roborecover donors`, `lerobot-train`); on the next, the base's trials are forked with that Correction, and
+(`curate donors`, `lerobot-train`); on the next, the base's trials are forked with that Correction, and
 detectors fitted; on the third, their thresholds are set. Then every arm is run on the test scenarios, and
 reported. What is finished is skipped. `--store` keeps the outcomes with the code, `--stored` reports those.
 """
@@ -96,7 +96,7 @@ class SteppingIn:
 
     @property
     def _watched(self) -> Path:
-        """Where `eval-monitor` keeps trials, and finds those that were forked."""
+        """Where `detect evaluate` keeps trials, and finds those that were forked."""
         return self.out / "detectors.work"
 
     def trials(
@@ -134,8 +134,8 @@ class SteppingIn:
                 for word in ("--trials-from", logs[policy].parent, "--deterministic", policy)
             ]
             roborecover(
-                "donors", *logs.values(), "--scenarios", self.subject.scenarios, "--base", base, *named,
-                "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
+                "curate", "donors", *logs.values(), "--scenarios", self.subject.scenarios, "--base", base,
+                *named, "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
             )  # fmt: skip
         training = Training(
             Path("policies/train/correction_act.yaml"), donors, self.out / "correction_training",
@@ -152,7 +152,7 @@ class SteppingIn:
         ]
         out = self.out / "forks"
         roborecover(
-            "fork", *logs, "--policy", self.subject.base, "--deterministic",
+            "detect", "fork", *logs, "--policy", self.subject.base, "--deterministic",
             "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every),
             "--env", self._snapshots(), "--out", out,
         )  # fmt: skip
@@ -163,7 +163,7 @@ class SteppingIn:
         out = self.out / "detectors"
         named = [word for name, what in DETECTORS.items() for word in ("--detector", f"{name}={what}")]
         roborecover(
-            "eval-monitor", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
+            "detect", "evaluate", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
             "--env", "obs_type=state", "--env", self._snapshots(), *named, "--forks", forks,
             "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",

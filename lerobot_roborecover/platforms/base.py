@@ -36,7 +36,7 @@ type Driver = Callable[[int], np.ndarray]
 
 @dataclass(frozen=True)
 class Expert:
-    """A scripted driver, for `roborecover collect --expert`."""
+    """A scripted driver, for `roborecover curate collect --expert`."""
 
     make: Callable[[Any, Task, np.random.Generator], Driver]
     """From a simulator that was reset and has settled, the task, and the random stream of drivers that
@@ -102,7 +102,7 @@ class Platform:
     clustered: ClassVar[bool] = False
     """Several scenarios come of one trajectory: statistics resample trajectories, not scenarios."""
     apart: ClassVar[tuple[str, ...]] = ("trajectory", "record")
-    """What may not lie on both sides of a split (`roborecover split`), where nobody says otherwise."""
+    """What may not lie on both sides of a split (`roborecover curate split`), where nobody says otherwise."""
     images_rotated_180: ClassVar[bool] = False
     """Observed pictures leave the simulator rotated by 180 degrees."""
     sizes_pictures: ClassVar[bool] = True
@@ -286,7 +286,7 @@ class Platform:
         return self.first_reset(task, seed=number)
 
     def random_actions(self, rng: np.random.Generator, steps: int, width: int) -> np.ndarray:
-        """(steps, width) float64 that move the robot about without harm, for `check-platform`."""
+        """(steps, width) float64 that move the robot about without harm, for `check platform`."""
         return rng.uniform(-1.0, 1.0, (steps, width)) * min(self.action_bound, 1.0)
 
     def no_op(self) -> np.ndarray:

@@ -3,7 +3,7 @@ completes the task all the same.
 
     python -m recipes.libero.scripted_operator --out OUT --init-states 16-19
 
-Starts `roborecover teleop`'s server and talks to it over its websocket, as the page does. What the scripted
+Starts `curate teleop`'s server and talks to it over its websocket, as the page does. What the scripted
 expert has to know of the scene does not travel over it: a simulator of the operator's own goes along, action
 by action, and has to be where the server's is, exactly. It stands in for a person where nobody can be asked;
 its recordings name it as driver.

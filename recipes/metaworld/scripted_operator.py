@@ -3,7 +3,7 @@ the task all the same.
 
     python -m recipes.metaworld.scripted_operator --out OUT --tasks study --seeds 500-505
 
-Starts `roborecover teleop`'s server and talks to it over its websocket, as the page does. It stands in for a
+Starts `curate teleop`'s server and talks to it over its websocket, as the page does. It stands in for a
 person where nobody can be asked, such as in the study that anyone re-runs; its recordings name it as driver.
 """
 

@@ -218,7 +218,7 @@ def test_forks_that_teach_nothing_are_refused(dataset, policy, forks, tmp_path, 
     with_log = ("--forks", str(forks))
     refused("recovery_gain learns from forks: give --forks LOG")
     refused("no detector learns from forks", *with_log, detectors=("elapsed",))
-    refused("no log there; `roborecover fork --out", "--forks", str(tmp_path))
+    refused("no log there; `roborecover detect fork --out", "--forks", str(tmp_path))
     refused("no arm begins with 'rollback'", *with_log, detectors=("recovery_gain,arm=rollback",))
     refused("in training and in validation", *with_log, "--split", "train")
     refused("Fork its own trials", *with_log, of=save_policy(tmp_path / "other", "diffusion"))
