@@ -145,10 +145,8 @@ def nearest_name(word: str, group: str = "") -> str:
         names[old] = now[0]
     names |= {name: name for name in GROUPS}
     names |= {command.name: command.name for command in in_group("")}
+    names["evaluate"] = "eval"  # and not `detect evaluate`
     inside = {command.word: command.name for command in in_group(group)} if group else {}
-    begun = [command.name for command in in_group("") if word.startswith(command.name)]
-    if begun and not group:  # "evaluate" is `eval`, and not `detect evaluate`
-        return begun[0]
     for known in (inside, names):
         for name in get_close_matches(word, known, 1):
             return known[name]

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.main import command_module, main
-from lerobot_roborecover.cli.tree import COMMANDS, GROUPS, SPLIT_NAMES, in_group
+from lerobot_roborecover.cli.main import build_parser, command_module, main
+from lerobot_roborecover.cli.tree import COMMANDS, GROUPS, SPLIT_NAMES, in_group, overview
 
 OURS = [c for c in COMMANDS if not hasattr(command_module(c.module), "pass_through")]
 """Those whose arguments we parse; LeRobot parses the others'."""
@@ -80,6 +80,20 @@ def test_help_is_one_screen_and_lists_everything(capsys):
     assert max(map(len, lines)) <= 80
     words = set(re.findall(r"[\w-]+", out))
     assert [c.name for c in COMMANDS if c.word not in words] == []
+
+
+def test_the_page_of_commands_is_what_help_prints():
+    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
+    assert f"```\n{overview()}```" in page
+    assert [c.old for c in COMMANDS if c.old and f"`{c.old}`" not in page] == []
+
+
+def test_a_completion_script_knows_groups_commands_and_options():
+    shtab = pytest.importorskip("shtab", reason="uv pip install shtab")
+    script = shtab.complete(build_parser(), shell="bash")
+    words = set(re.findall(r"[\w-]+", script))
+    assert {"curate", "training-data", "--trials-folder"} <= words
+    assert "eval-monitor" not in words
 
 
 @pytest.mark.parametrize("group", GROUPS)
