@@ -276,7 +276,7 @@ def test_writing_episodes_says_nothing_of_ffmpegs(tmp_path, capfd, monkeypatch):
 def test_a_commands_output_is_its_own(tmp_path):
     """In a process of its own, as a user runs it; two parts are written and joined."""
     source = write_scenarios(tmp_path / "set", [fake_scenario(i, steps=4) for i in range(11)])
-    argv = ["render", str(source), "--out", str(tmp_path / "out"), "--frames", "64"]
+    argv = ["dataset", "render", str(source), "--out", str(tmp_path / "out"), "--frames", "64"]
     command = [sys.executable, "-m", "lerobot_roborecover.cli.main", *argv]
     environment = {k: v for k, v in os.environ.items() if k not in ("SVT_LOG", "TQDM_DISABLE")}
     done = subprocess.run(command, capture_output=True, env=environment, check=True)
