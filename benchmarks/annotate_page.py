@@ -2,7 +2,7 @@
 
     python benchmarks/annotate_page.py [--episodes 1000] [--steps 300] [--side 256]
 
-Makes a dataset of two cameras (drifting texture, which compresses badly), starts `roborecover annotate`,
+Makes a dataset of two cameras (drifting texture, which compresses badly), starts `curate annotate`,
 opens it in headless Chromium and presses keys. A key's time runs from its event to the end of the animation
 frame in which both cameras show the new frame.
 """
@@ -70,6 +70,7 @@ def main() -> None:
             sys.executable,
             "-m",
             "lerobot_roborecover.cli.main",
+            "curate",
             "annotate",
             str(root),
             "--no-examples",

@@ -1,5 +1,5 @@
-"""Made-up monitors and annotators, and how often the intervals of `eval-monitor` and `agree` hold: two parts
-of `coverage.py`."""
+"""Made-up monitors and annotators, and how often the intervals of `detect evaluate-frames` and
+`curate agree` hold: two parts of `coverage.py`."""
 
 from __future__ import annotations
 

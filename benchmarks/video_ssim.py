@@ -2,9 +2,9 @@
 
     python benchmarks/video_ssim.py --task assembly-v3 --size 480 --steps 120 --step 100
 
-Records one rollout of a Meta-World expert, encodes it as `roborecover collect` does (LeRobot's default), and
+Records one rollout of a Meta-World expert, encodes it as `curate collect` does (LeRobot's default), and
 compares the decoded last five frames up to `--step` with the very frames that were encoded: as they are,
-through the same encoder with the window that `roborecover validate` takes, and with the frames after the
+through the same encoder with the window that `curate validate` takes, and with the frames after the
 recovery point left out. Everything is of the same state: what is below 1 is the video's doing.
 """
 

@@ -1,7 +1,8 @@
 """RoboRecover for LeRobot: measure, and improve, how robot policies recover from their own deviations.
 
-Importing this package is light: no LeRobot, torch or simulator comes with it. It registers the Gymnasium ids
-`roborecover/<Platform>-v0`, such as `roborecover/Libero-v0`, and pins how simulators round.
+Importing this package is light: no LeRobot, torch, numpy or simulator comes with it. It registers the
+Gymnasium ids `roborecover/<Platform>-v0`, such as `roborecover/Libero-v0`, when Gymnasium is imported, and
+pins how simulators round.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from lerobot_roborecover.utils.determinism import pin_blas_kernels
 pin_blas_kernels()  # before numpy is imported
 
 from lerobot_roborecover._version import __version__  # noqa: E402
-from lerobot_roborecover.workers.registration import register  # noqa: E402
+from lerobot_roborecover.workers.registration import register_with_gymnasium  # noqa: E402
 
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.make import report
@@ -51,7 +52,7 @@ _WHERE = {
 }
 """Module of each name that is imported when it is asked for."""
 
-register()
+register_with_gymnasium()
 
 
 def __getattr__(name: str) -> Any:

@@ -7,7 +7,7 @@ It is compared with never intervening and always intervening on scenarios that n
     python -m recipes.stepping_in --platform metaworld --out outputs/stored --stored
 
 The training scenarios are divided, by what they share, into three parts. The first trains Correction
-(`roborecover donors`, `lerobot-train`). On the second, the base's trials are forked with that Correction, and
+(`curate donors`, `lerobot-train`). On the second, the base's trials are forked with that Correction, and
 detectors are fitted. The third sets their thresholds. Then every arm runs on the test scenarios, and the
 report is written. Finished parts are skipped. `--store` keeps the outcomes with the code, `--stored` reports
 those.
@@ -98,7 +98,7 @@ class SteppingIn:
 
     @property
     def _watched(self) -> Path:
-        """Where `eval-monitor` keeps trials, and finds those that were forked."""
+        """Where `detect evaluate` keeps trials, and finds those that were forked."""
         return self.out / "detectors.work"
 
     def trials(
@@ -136,8 +136,8 @@ class SteppingIn:
                 for word in ("--trials-from", logs[policy].parent, "--deterministic", policy)
             ]
             roborecover(
-                "donors", *logs.values(), "--scenarios", self.subject.scenarios, "--base", base, *named,
-                "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
+                "curate", "donors", *logs.values(), "--scenarios", self.subject.scenarios, "--base", base,
+                *named, "--env", "obs_type=state", "--license", "Apache-2.0", "--out", donors,
             )  # fmt: skip
         training = Training(
             Path("policies/train/correction_act.yaml"), donors, self.out / "correction_training",
@@ -154,7 +154,7 @@ class SteppingIn:
         ]
         out = self.out / "forks"
         roborecover(
-            "fork", *logs, "--policy", self.subject.base, "--deterministic",
+            "detect", "fork", *logs, "--policy", self.subject.base, "--deterministic",
             "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every),
             "--env", self._snapshots(), "--out", out,
         )  # fmt: skip
@@ -165,7 +165,7 @@ class SteppingIn:
         out = self.out / "detectors"
         named = [word for name, what in DETECTORS.items() for word in ("--detector", f"{name}={what}")]
         roborecover(
-            "eval-monitor", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
+            "detect", "evaluate", "--scenarios", self.subject.scenarios, "--policy", self.subject.base,
             "--env", "obs_type=state", "--env", self._snapshots(), *named, "--forks", forks,
             "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 HEAVY = ("lerobot", "torch", "mujoco", "metaworld", "libero", "robosuite", "datasets", "huggingface_hub")
 
 
@@ -18,7 +20,58 @@ def modules_after(code: str) -> set[str]:
 
 def test_importing_the_package_is_light():
     loaded = modules_after("import lerobot_roborecover")
-    assert not loaded & {*HEAVY, "pyarrow", "matplotlib", "scipy"}
+    assert not loaded & {*HEAVY, "pyarrow", "matplotlib", "scipy", "numpy", "gymnasium"}
+
+
+def test_help_is_light():
+    """It costs a tenth of a second, most of it Python's own."""
+    code = (
+        "from lerobot_roborecover.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    print()"
+    )
+    assert not modules_after(code) & {
+        *HEAVY,
+        "pyarrow",
+        "matplotlib",
+        "scipy",
+        "numpy",
+        "gymnasium",
+        "jinja2",
+    }
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import lerobot_roborecover, gymnasium",
+        "import gymnasium, lerobot_roborecover",
+        "import importlib.util, lerobot_roborecover; importlib.util.find_spec('gymnasium'); import gymnasium",
+        # Gymnasium's import begins in the middle of these.
+        *(
+            f"import lerobot_roborecover.{name}, gymnasium"
+            for name in ("platforms", "platforms.lerobot", "platforms.fake.simulator", "workers.recovery_env")
+        ),
+    ],
+)
+def test_gymnasium_knows_the_ids_whoever_is_imported_first(code):
+    check = (
+        f"{code}\nassert 'roborecover/Lerobot_pusht-v0' in gymnasium.registry"
+        "\nimport inspect, sys; assert inspect.getsource(gymnasium)"
+        "\nassert not [f for f in sys.meta_path if 'roborecover.' in type(f).__module__], 'no finder is left'"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", check], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("first", ["import lerobot_roborecover; ", ""])
+def test_gymnasium_makes_an_environment_by_module_and_id(first):
+    code = (
+        f"{first}import gymnasium\n"
+        "from tests.support.factories import fake_scenario\n"
+        "env = gymnasium.make('lerobot_roborecover:roborecover/Fake-v0', scenario=fake_scenario(0))\n"
+        "env.reset()"
+    )
+    assert modules_after(code)
 
 
 def test_a_worker_needs_neither_lerobot_nor_torch():

@@ -74,7 +74,7 @@ def note_of(row: TrialRow) -> ForkNote | None:
     except TypeError as err:
         raise ScenarioError(
             f"trial {row.trial} of {row.scenario_id}: options.fork cannot be read ({err}); it was written by "
-            "another version. Run roborecover fork again"
+            "another version. Run roborecover detect fork again"
         ) from None
 
 
@@ -187,7 +187,7 @@ def fork_gains(rows: Iterable[TrialRow], unit: ResamplingUnit | None = None) -> 
         elif Outcome(row.outcome).valid:
             continued[key] = row
     if not platform:
-        raise ScenarioError("the log has no forks; roborecover fork writes some")
+        raise ScenarioError("the log has no forks; roborecover detect fork writes some")
     pairs = [
         ForkPair(note, row, continued[key])
         for key, note, row in others

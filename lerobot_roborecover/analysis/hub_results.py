@@ -60,7 +60,7 @@ def results_yaml(board: Board, entry: Entry, dataset_id: str | None = None, sour
         raise RowsError(
             f"the scenario set {dataset!r} is not a data set on the Hub, which the metadata must "
             "name. Publish it "
-            "(roborecover publish) and evaluate from there, or say --dataset-id ORG/NAME"
+            "(roborecover dataset publish) and evaluate from there, or say --dataset-id ORG/NAME"
         )
     if source is not None and not re.fullmatch(r"https?://\S+", source):
         raise RowsError(

@@ -115,7 +115,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
         if any(FORK in row.options for row in log.rows):
             raise RowsError(
                 f"{path} holds forks of other trials, which say nothing of a policy at the recovery point: "
-                "the page beside it says what they gain (roborecover fork)"
+                "the page beside it says what they gain (roborecover detect fork)"
             )
         for row in log.rows:
             other = rows.setdefault((row.policy, run or 0, *row.key()), row)

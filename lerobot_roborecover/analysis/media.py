@@ -19,7 +19,7 @@ def find_media(folder: Path, ids: Sequence[str]) -> dict[str, Path]:
     """A video or recording of each scenario, the first trial's where there are several.
 
     Taken are `<group>_<scenario>/eval_episode_0.mp4` of `lerobot-eval`, `<scenario>_trial<k>_<outcome>.mp4`
-    of `roborecover eval`, `<scenario>/replay.rrd` of `roborecover inspect`, and `<scenario>.mp4` or `.rrd`.
+    of `roborecover eval`, `<scenario>/replay.rrd` of `dataset inspect`, and `<scenario>.mp4` or `.rrd`.
 
     Args:
         folder: where they are, at any depth.

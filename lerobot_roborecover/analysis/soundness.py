@@ -25,7 +25,7 @@ _CHECKS = {
     Outcome.SIM_ERROR: "the simulator failed: read field `reason` of the log's rows, and run `roborecover "
     "doctor`",
     Outcome.POLICY_ERROR: "the policy failed: read field `reason` of the log's rows, and run `roborecover "
-    "check-policy`",
+    "check policy`",
     Outcome.TIMEOUT: "simulator or policy did not answer in time: read field `reason` of the log's rows",
 }
 """What to look at first, by the outcome that most trials have."""

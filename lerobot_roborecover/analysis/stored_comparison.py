@@ -41,7 +41,7 @@ def read_comparison(folder: Path) -> StoredComparison:
     """Computes a comparison of detectors again.
 
     Args:
-        folder: the `--out` of `roborecover eval-monitor --detector`; its numbers and scores are read.
+        folder: the `--out` of `roborecover detect evaluate`; its numbers and scores are read.
 
     Raises:
         RowsError: the folder holds no such comparison, or a file is damaged.
@@ -63,7 +63,7 @@ def read_comparison(folder: Path) -> StoredComparison:
         reason = f"it has no field {err}" if isinstance(err, KeyError) else str(err)[:200]
         raise RowsError(
             f"{path} is not the record of a comparison of detectors ({reason}). Name the --out of "
-            "roborecover eval-monitor --detector"
+            "roborecover detect evaluate"
         ) from None
     scored = {name: read_scores(folder / SCORES_FOLDER / f"{Path(name).name}.npz") for name in detectors}
     measured = [_measured(name, scored[name], detectors[name], alpha, level, seed) for name in detectors]

@@ -1,4 +1,4 @@
-"""`roborecover agree`."""
+"""`roborecover curate agree`."""
 
 from __future__ import annotations
 

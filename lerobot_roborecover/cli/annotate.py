@@ -1,4 +1,4 @@
-"""`roborecover annotate`."""
+"""`roborecover curate annotate`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--only",
         type=Path,
         metavar="LIST",
-        help="a further round over what `roborecover agree --discuss` lists",
+        help="a further round over what `roborecover curate agree --discuss` lists",
     )
     add(
         "--no-examples", action="store_true",

@@ -1,4 +1,4 @@
-"""`roborecover build`."""
+"""`roborecover curate build`."""
 
 from __future__ import annotations
 

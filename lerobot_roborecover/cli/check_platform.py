@@ -1,4 +1,4 @@
-"""`roborecover check-platform`."""
+"""`roborecover check platform`."""
 
 from __future__ import annotations
 

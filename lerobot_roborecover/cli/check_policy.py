@@ -1,4 +1,4 @@
-"""`roborecover check-policy`: what can go wrong with a policy, before an hour is spent."""
+"""`roborecover check policy`: what can go wrong with a policy, before an hour is spent."""
 
 from __future__ import annotations
 

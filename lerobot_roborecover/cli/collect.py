@@ -1,4 +1,4 @@
-"""`roborecover collect`."""
+"""`roborecover curate collect`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,19 @@ HELP = "Roll out a policy or a scripted driver from initial states, and keep its
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command's own arguments; `--policy.*` and `--env.*` are LeRobot's."""
+    """The command's own parser; `--policy.*` and `--env.*` are LeRobot's."""
     parser = argparse.ArgumentParser(
-        prog="roborecover collect",
+        prog="roborecover curate collect",
         description=HELP,
         epilog="--policy.path=CHECKPOINT and any --policy.OPTION=VALUE, --env.type=roborecover_libero and "
         "any --env.OPTION=VALUE are those of roborecover eval. A rerun goes on where it was stopped.",
     )
+    add_arguments(parser)
+    return parser
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's own arguments."""
     add = parser.add_argument
     add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy; ? lists them")
     add("--name", default="", help="recorded name of the driver (checkpoint, or expert)")
@@ -80,7 +86,6 @@ def build_parser() -> argparse.ArgumentParser:
         help="licence by the Hub's identifier, of the dataset; none is assumed",
     )
     add("--dry-run", action="store_true", help="list the rollouts, and run none")
-    return parser
 
 
 def pass_through(argv: Sequence[str]) -> int:

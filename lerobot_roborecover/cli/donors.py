@@ -1,4 +1,4 @@
-"""`roborecover donors`."""
+"""`roborecover curate donors`."""
 
 from __future__ import annotations
 

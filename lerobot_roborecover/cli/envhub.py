@@ -1,4 +1,4 @@
-"""`roborecover envhub`."""
+"""`roborecover dataset envhub`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover export-training`."""
+"""`roborecover curate training-data`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "sources", nargs="+", type=Path,
-        help="trial logs of runs with --env.record_actions=true, logs of roborecover fork, folders of donors",
+        help="trial logs of runs with --env.record_actions=true, logs of `detect fork`, folders of donors",
     )  # fmt: skip
     add("--scenarios", required=True, help="scenario set of the trials: folder, Hub id or shipped name")
     add("--revision", help="commit, tag or branch of that set on the Hub")

@@ -1,4 +1,4 @@
-"""`roborecover fork`."""
+"""`roborecover detect fork`."""
 
 from __future__ import annotations
 

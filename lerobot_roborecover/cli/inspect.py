@@ -1,4 +1,4 @@
-"""`roborecover inspect`."""
+"""`roborecover dataset inspect`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover <command>`: finds the command, parses its arguments, and turns a refusal into one line."""
+"""`roborecover COMMAND`: finds the command, parses its arguments, and turns a refusal into one line."""
 
 from __future__ import annotations
 
@@ -7,72 +7,58 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from types import ModuleType
+from typing import NoReturn
 
 from lerobot_roborecover._version import __version__
 from lerobot_roborecover.cli.guard import guarded
-
-COMMANDS = (
-    "doctor",
-    "check-platform",
-    "demo",
-    "study",
-    "check-policy",
-    "plan",
-    "eval",
-    "reproduce",
-    "merge",
-    "report",
-    "compare",
-    "fork",
-    "leaderboard",
-    "publish",
-    "envhub",
-    "pull",
-    "inspect",
-    "repair",
-    "serve",
-    "donors",
-    "export-ema",
-    "export-training",
-    "monitor-data",
-    "eval-monitor",
-    "teleop",
-    "collect",
-    "annotate",
-    "agree",
-    "screen",
-    "validate",
-    "split",
-    "render",
-    "build",
+from lerobot_roborecover.cli.tree import (
+    COMMANDS,
+    GROUPS,
+    Call,
+    Command,
+    find_call,
+    group_help,
+    in_group,
+    nearest_name,
+    overview,
 )
-"""Each is a module of this folder (dashes as underscores) with `HELP`, `add_arguments(parser)` and
-`run(args) -> exit status`; or, where another parser reads the arguments, with `HELP` and
-`pass_through(argv) -> exit status`."""
 
 
-def _module(command: str) -> ModuleType:
-    return importlib.import_module(f"lerobot_roborecover.cli.{command.replace('-', '_')}")
+def command_module(name: str) -> ModuleType:
+    """Imports a command's module, by its name in this folder."""
+    return importlib.import_module(f"lerobot_roborecover.cli.{name}")
+
+
+def command_parser(call: Call) -> argparse.ArgumentParser:
+    """Returns the parser of one command, which says the name that was typed."""
+    module = command_module(call.module)
+    parser = argparse.ArgumentParser(prog=f"roborecover {call.name}", description=module.HELP)
+    module.add_arguments(parser)
+    parser.set_defaults(run=module.run)
+    return parser
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; imports nothing heavy."""
-    parser = argparse.ArgumentParser(
-        prog="roborecover",
-        description="Measure, and improve, how robot policies recover. Evaluation itself is lerobot-eval's: "
-        "lerobot-eval --env roborecover_libero --policy.path=CHECKPOINT",
-    )
+    """Returns one parser of all commands, for tables and for shell completion; imports nothing heavy."""
+    parser = argparse.ArgumentParser(prog="roborecover", description="How robot policies recover.")
     parser.add_argument("--version", action="version", version=f"roborecover {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name in COMMANDS:
-        module = _module(name)
-        command = commands.add_parser(name, help=module.HELP, description=module.HELP)
-        if hasattr(module, "pass_through"):
-            continue
-        module.add_arguments(command)
-        command.set_defaults(run=module.run)
+    top = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in in_group(""):
+        _add_command(top, command)
+    for group, summary in GROUPS.items():
+        inner = top.add_parser(group, help=summary).add_subparsers(required=True, metavar="COMMAND")
+        for command in in_group(group):
+            _add_command(inner, command)
     return parser
+
+
+def _add_command(commands: argparse._SubParsersAction, command: Command) -> None:
+    module = command_module(command.module)
+    parser = commands.add_parser(command.word, help=command.summary, description=module.HELP)
+    if hasattr(module, "add_arguments"):
+        module.add_arguments(parser)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,29 +77,66 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = main(sys.argv[1:])
         policy_thread.exit_process(status)
         return status
-    argv = list(argv)
-    command = argv[0] if argv else ""
-    quiet(command)
-    return guarded(f"roborecover {command}", lambda: _run(command, argv))
+    call = find_call(argv)
+    if call is None:
+        return guarded("roborecover", lambda: _without_command(argv))
+    quiet(call.module)
+    return guarded(f"roborecover {call.name}", lambda: _run(call))
 
 
-def _run(command: str, argv: list[str]) -> int:
-    module = _module(command) if command in COMMANDS else None
-    if module is not None and hasattr(module, "pass_through"):
-        return module.pass_through(argv[1:])
-    args = build_parser().parse_args(argv)
+def _run(call: Call) -> int:
+    if call.note:
+        with suppress(OSError):  # standard error may be closed
+            print(call.note, file=sys.stderr)
+    module = command_module(call.module)
+    if hasattr(module, "pass_through"):
+        return module.pass_through(list(call.rest))
+    args = command_parser(call).parse_args(call.rest)
     return args.run(args)
 
 
-def quiet(command: str) -> None:
+class _ListParser(argparse.ArgumentParser):
+    """Takes `--help` and `--version` where no command is named; its help is a text of ours."""
+
+    def __init__(self, prog: str, text: str) -> None:
+        super().__init__(prog=prog, usage=f"{prog} COMMAND ...")
+        self.text = text
+        self.add_argument("--version", action="version", version=f"roborecover {__version__}")
+        self.add_argument("command", nargs="?")
+        self.add_argument("rest", nargs=argparse.REMAINDER)
+
+    def format_help(self) -> str:
+        return self.text
+
+
+def _without_command(argv: Sequence[str]) -> NoReturn:
+    """Prints help, or names the commands that are nearest to what was typed; exits."""
+    group = argv[0] if argv and argv[0] in GROUPS else ""
+    parser = _ListParser(f"roborecover {group}".strip(), group_help(group) if group else overview())
+    word = parser.parse_args(argv[1:] if group else argv).command
+    if not word:
+        parser.print_help(sys.stderr)
+        parser.exit(2)
+    near = nearest_name(word, group)
+    parser.error(
+        f'there is no command "{word[:80]}"; '
+        + (f'the nearest is "roborecover {near}"' if near else f'"{parser.prog} --help" lists them')
+    )
+
+
+def quiet(module: str) -> None:
     """Keeps libraries from burying a command's own lines in theirs, in this process and those it starts.
 
     Args:
-        command: `study` trains with LeRobot's own commands, whose bars are the only progress there is.
+        module: of the command. `study` trains with LeRobot's own commands, whose bars are the only progress
+            there is.
     """
     os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a film
-    if command != "study":
+    if module != "study":
         os.environ.setdefault("TQDM_DISABLE", "1")
+
+
+__all__ = ["COMMANDS", "build_parser", "command_module", "command_parser", "main"]
 
 
 if __name__ == "__main__":

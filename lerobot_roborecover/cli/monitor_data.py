@@ -1,4 +1,4 @@
-"""`roborecover monitor-data`."""
+"""`roborecover detect data`."""
 
 from __future__ import annotations
 

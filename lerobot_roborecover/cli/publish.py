@@ -1,4 +1,4 @@
-"""`roborecover publish`."""
+"""`roborecover dataset publish`."""
 
 from __future__ import annotations
 

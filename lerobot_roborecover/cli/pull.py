@@ -1,4 +1,4 @@
-"""`roborecover pull`."""
+"""`roborecover dataset pull`."""
 
 from __future__ import annotations
 

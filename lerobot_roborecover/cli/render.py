@@ -1,4 +1,4 @@
-"""`roborecover render`."""
+"""`roborecover dataset render`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover repair`."""
+"""`roborecover dataset repair`."""
 
 from __future__ import annotations
 

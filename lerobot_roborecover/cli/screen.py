@@ -1,4 +1,4 @@
-"""`roborecover screen`."""
+"""`roborecover curate screen`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover split`."""
+"""`roborecover curate split`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover teleop`."""
+"""`roborecover curate teleop`."""
 
 from __future__ import annotations
 

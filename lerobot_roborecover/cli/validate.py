@@ -1,4 +1,4 @@
-"""`roborecover validate`."""
+"""`roborecover curate validate`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,9 @@ def request(args: argparse.Namespace) -> ValidationRequest:
     from lerobot_roborecover.errors import OptionError
 
     if args.trials_folder is None:
-        raise OptionError("--trials-folder is missing: name the folder where roborecover screen kept trials")
+        raise OptionError(
+            "--trials-folder is missing: name the folder of trials that roborecover curate screen kept"
+        )
     return ValidationRequest(
         dataset=args.dataset,
         trials_folder=args.trials_folder,

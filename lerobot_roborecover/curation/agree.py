@@ -1,4 +1,4 @@
-"""`roborecover agree`: from votes on a candidate dataset to agreement, a list to discuss, and scenarios."""
+"""`curate agree`: from votes on a candidate dataset to agreement, a list to discuss, and scenarios."""
 
 from __future__ import annotations
 
@@ -66,5 +66,9 @@ def agree(request: AgreeRequest, say: Callable[[str], None]) -> Resolution:
         write_resolution(request.out, candidates, found, request.config, license=request.license)
         say(f"{pluralize(counts['kept'], 'scenario')} in {request.out}")
         say(attrition_table(count_stages(read_decisions(request.out))))
-        say(next_command(["screen", str(request.out), "--policy", "CHECKPOINT", "--out", "SCREENED"]))
+        say(
+            next_command(
+                ["curate", "screen", str(request.out), "--policy", "CHECKPOINT", "--out", "SCREENED"]
+            )
+        )
     return found

@@ -1,4 +1,4 @@
-"""`roborecover publish`: a dataset folder on the Hub, with or without what it says of people."""
+"""`roborecover dataset publish`: a dataset folder on the Hub, with or without what it says of people."""
 
 from __future__ import annotations
 

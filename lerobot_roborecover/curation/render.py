@@ -101,8 +101,8 @@ def describe(request: RenderRequest, episodes: int) -> str:
 
 
 def publish_next(root: Path) -> list[str]:
-    """Arguments of the `publish` that follows, which is to be completed."""
-    return ["publish", str(root), "--repo-id", "ORG/NAME"]
+    """Arguments of the `dataset publish` that follows, which is to be completed."""
+    return ["dataset", "publish", str(root), "--repo-id", "ORG/NAME"]
 
 
 def check_size(size: int) -> None:

@@ -207,7 +207,7 @@ def to_vote_on(candidates: CandidateSet, only: Path | None) -> tuple[set[str], D
 
     Args:
         candidates: the dataset.
-        only: a list of candidates to discuss (`roborecover agree --discuss`).
+        only: a list of candidates to discuss (`roborecover curate agree --discuss`).
 
     Raises:
         ScenarioError: the list cannot be read or names others, or no candidate is left.
@@ -315,7 +315,7 @@ def write_resolution(
 
 
 def write_discussion(path: Path, resolution: Resolution) -> int:
-    """Writes the candidates without consensus as a list for a further round of `roborecover annotate`.
+    """Writes the candidates without consensus as a list for a further round of `roborecover curate annotate`.
 
     Returns:
         The number of candidates; nothing is written where there are none.

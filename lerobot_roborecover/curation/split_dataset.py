@@ -187,7 +187,7 @@ def describe(report: SplitReport, root: Path) -> str:
     rows = count_stages(read_decisions(root))
     funnel = [attrition_table(rows)] if rows else []
     return "\n".join(
-        (format_report(report), *funnel, next_command(["render", str(root), "--out", "RENDERED"]))
+        (format_report(report), *funnel, next_command(["dataset", "render", str(root), "--out", "RENDERED"]))
     )
 
 

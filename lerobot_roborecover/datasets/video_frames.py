@@ -23,7 +23,7 @@ MAX_INFO_BYTES = 2**24
 MAX_FILM_S = 1e7
 REMEDY = (
     "a video with frames missing or too many shows the pictures of other steps. Record or render the episode "
-    "again, or take it out with lerobot-edit-dataset's delete_episodes and run roborecover repair"
+    "again, or take it out with lerobot-edit-dataset's delete_episodes and run roborecover dataset repair"
 )
 
 
@@ -64,7 +64,7 @@ def check_frames(root: Path, steps: Sequence[int] | None = None, *, thorough: bo
     if steps is not None and episodes != set(range(len(steps))):
         raise ScenarioError(
             f"{root}/meta/episodes names {len(episodes)} episodes, the dataset's own metadata {len(steps)}; "
-            "fetch or write the dataset again, or run roborecover repair after LeRobot's tools"
+            "fetch or write the dataset again, or run roborecover dataset repair after LeRobot's tools"
         )
     total = 0
     for clip in clips:

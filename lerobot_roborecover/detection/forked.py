@@ -36,7 +36,7 @@ class ForkedTrial:
 
 @dataclass(frozen=True)
 class ForkLog:
-    """What a log of `roborecover fork` says of one arm."""
+    """What a log of `roborecover detect fork` says of one arm."""
 
     path: Path
     arm: str
@@ -62,7 +62,7 @@ def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
     """Reads a log of forks.
 
     Args:
-        log: the file, or the folder that `roborecover fork --out` filled.
+        log: the file, or the folder that `roborecover detect fork --out` filled.
         policy: identity of the policy whose trials must have been forked (`policy_metadata`).
         arm: label of the arm, or how it begins; empty where the log has one.
 
@@ -72,7 +72,7 @@ def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
     """
     path = log / TRIALS_FILE if log.is_dir() else log
     if not path.is_file():
-        raise MonitorError(f"--forks {log}: no log there; `roborecover fork --out {log}` writes one")
+        raise MonitorError(f"--forks {log}: no log there; `roborecover detect fork --out {log}` writes one")
     gains = fork_gains(read_trial_log(path))
     arms = [a for a in gains.arms if a == arm] or [a for a in gains.arms if a.startswith(arm)]
     if len(arms) != 1:

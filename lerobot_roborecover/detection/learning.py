@@ -88,8 +88,8 @@ def fork_logs(
     learning = {n.name: d for n in named if _learns_from_forks(d := n.detector)}
     if bool(learning) != (request.forks is not None):
         raise MonitorError(
-            f"--detector {min(learning)} learns from forks: give --forks LOG, which `roborecover fork` makes "
-            "of the policy's trials on other scenarios"
+            f"--detector {min(learning)} learns from forks: give --forks LOG, which `roborecover detect "
+            "fork` makes of the policy's trials on other scenarios"
             if learning
             else f"--forks {request.forks}: no detector learns from forks; add --detector recovery_gain"
         )

@@ -1,4 +1,4 @@
-"""From detectors by name to their numbers: what `roborecover eval-monitor --detector` does."""
+"""From detectors by name to their numbers: what `roborecover detect evaluate` does."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class DetectionRequest:
     training_data: Path | None = None
     """LeRobotDataset that the policy was trained on, for the distance from training states."""
     forks: Path | None = None
-    """Log of `roborecover fork` on the policy's trials, for the expected gain."""
+    """Log of `roborecover detect fork` on the policy's trials, for the expected gain."""
     alpha: float = 0.1
     """False-alarm rate of the conformal thresholds, a clean rollout."""
     on_training_scenarios: bool = False

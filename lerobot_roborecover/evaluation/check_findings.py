@@ -1,4 +1,4 @@
-"""What `roborecover check-policy` found, as a table and as JSON."""
+"""What `roborecover check policy` found, as a table and as JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover check-policy`: what can go wrong with a policy, found before an hour is spent on it.
+"""`roborecover check policy`: what can go wrong with a policy, found before an hour is spent on it.
 
 The checkpoint is loaded as an evaluation loads it, its description is read, one scenario is handed off in the
 real simulator, and the policy takes a few steps there. What a mistake leaves in names, shapes, statistics and

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from lerobot_roborecover.datasets.card import render_card, render_text
@@ -11,6 +12,9 @@ from lerobot_roborecover.evaluation.envhub import HubScenarios
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.outputs import check_page
+
+_MADE_HERE = re.compile(rb"Made by `roborecover (dataset )?envhub`")
+"""In `env.py`; files of versions whose command was `envhub` are ours, too."""
 
 
 def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | None = None) -> list[Path]:
@@ -31,7 +35,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
     if Path(scenarios.source).expanduser().is_dir() and scenarios.revision is None:
         raise OptionError(
             f"scenarios {scenarios.source!r:.200}: a folder, which others do not have. Publish it "
-            "(roborecover publish), and name it as org/name"
+            "(roborecover dataset publish), and name it as org/name"
         )
     platform = platform_named(scenarios.platform)
     offer = HubScenarios(platform.name, scenarios.source, scenarios.revision, split)
@@ -53,7 +57,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         **values,
     )
     texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}
-    check_page(out, list(texts), lambda page: b"Made by `roborecover envhub`" in page.read_bytes())
+    check_page(out, list(texts), lambda page: _MADE_HERE.search(page.read_bytes()) is not None)
     for name, text in texts.items():
         atomic_write(out / name, text)
     return [out / name for name in texts]

@@ -2,7 +2,7 @@
 
 A row names its actions by their hash alone. With `--env.record_actions=true` the actions themselves lie in
 the folder `actions` beside the log, under that hash, and are there before the row is: a trial can then be
-replayed, forked (`roborecover fork`) and exported (`roborecover export-training`).
+replayed, forked (`roborecover detect fork`) and exported (`roborecover curate training-data`).
 """
 
 from __future__ import annotations

@@ -8,16 +8,13 @@ from __future__ import annotations
 import importlib
 import logging
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from lerobot_roborecover.platforms.base import Platform, SimulatorSetup
+from lerobot_roborecover.platforms.registry import BUILT_IN, ENTRY_POINTS, platform_names, registered
 from lerobot_roborecover.platforms.simulator import Observation, Simulator, SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
 
-ENTRY_POINTS = "roborecover.platforms"
-"""Entry-point group: `name = "module:PLATFORM"`, an instance of `Platform`, or the class."""
-BUILT_IN = ("libero", "metaworld", "robotwin", "fake", "lerobot")
 _FAMILY = "lerobot_"
 """Of names of the one family: `lerobot_<env type>`."""
 
@@ -40,13 +37,6 @@ def platform_named(name: str) -> Platform:
             f"of other distributions register under the entry point {ENTRY_POINTS!r}: is theirs installed?"
         )
     return found
-
-
-def platform_names() -> tuple[str, ...]:
-    """All names: ours first, the known env types of LeRobot's, then those of other distributions."""
-    from lerobot_roborecover.platforms import lerobot
-
-    return (*BUILT_IN, *lerobot.PLATFORM.members(), *_registered())
 
 
 def all_platforms() -> tuple[Platform, ...]:
@@ -78,20 +68,14 @@ def make_simulator(platform: str, **options: Any) -> Simulator:
 
 
 @cache
-def _registered() -> dict[str, EntryPoint]:
-    """Entry points by name, those with a name of ours aside: it stays ours."""
-    return {e.name: e for e in entry_points(group=ENTRY_POINTS) if e.name not in BUILT_IN}
-
-
-@cache
 def _load(name: str) -> Platform | None:
     if name in BUILT_IN:
         return importlib.import_module(f"lerobot_roborecover.platforms.{name}").PLATFORM
-    if name.startswith(_FAMILY) and name not in _registered():
+    if name.startswith(_FAMILY) and name not in registered():
         from lerobot_roborecover.platforms.lerobot import member
 
         return member(name)
-    entry = _registered().get(name)
+    entry = registered().get(name)
     if entry is None:
         return None
     of = f"platform {name!r} of {entry.dist.name if entry.dist else 'a distribution'} ({entry.value})"

@@ -36,7 +36,7 @@ type Driver = Callable[[int], np.ndarray]
 
 @dataclass(frozen=True)
 class Expert:
-    """A scripted driver, for `roborecover collect --expert`."""
+    """A scripted driver, for `roborecover curate collect --expert`."""
 
     make: Callable[[Any, Task, np.random.Generator], Driver]
     """From a simulator that was reset and has settled, the task, and the random stream of drivers that
@@ -102,7 +102,7 @@ class Platform:
     clustered: ClassVar[bool] = False
     """Several scenarios come of one trajectory: statistics resample trajectories, not scenarios."""
     apart: ClassVar[tuple[str, ...]] = ("trajectory", "record")
-    """What may not lie on both sides of a split; default of `roborecover split`."""
+    """What may not lie on both sides of a split; default of `roborecover curate split`."""
     images_rotated_180: ClassVar[bool] = False
     """Observed pictures leave the simulator rotated by 180 degrees."""
     sizes_pictures: ClassVar[bool] = True

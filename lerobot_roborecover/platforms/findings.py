@@ -1,4 +1,4 @@
-"""What a check of a machine or of a simulator found, for `roborecover doctor` and `check-platform`."""
+"""What a check of a machine or of a simulator found, for `roborecover doctor` and `check platform`."""
 
 from __future__ import annotations
 

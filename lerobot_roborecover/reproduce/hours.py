@@ -11,7 +11,7 @@ from lerobot_roborecover.scenario import Scenario
 
 @dataclass(frozen=True)
 class Costs:
-    """Parameters of the estimate, none of them measured: put in those of `roborecover check-policy`."""
+    """Parameters of the estimate, none of them measured: put in those of `roborecover check policy`."""
 
     step_ms: float = 12.0
     """Of a simulator, without picture. LIBERO's, on one core (docs/performance.md)."""

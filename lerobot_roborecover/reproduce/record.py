@@ -70,7 +70,7 @@ def verdict(result: ReproductionResult) -> str:
         end = (
             "The recovery arm was run all the same (--anyway); do not take it for this policy's."
             if result.recovery
-            else "The recovery arm was not run: find the cause first (roborecover check-policy; "
+            else "The recovery arm was not run: find the cause first (roborecover check policy; "
             "docs/policies.md), or say --anyway."
         )
         return f"**Not reproduced.** {said} The interval leaves zero out. {end}"

@@ -101,7 +101,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
         ),
         StudyStage(
             "scenarios",
-            (_cli("build", str(out / Path(recipe.chain).name)),),
+            (_cli("curate", "build", str(out / Path(recipe.chain).name)),),
             (Path(scenarios),),
         ),
     ]
@@ -132,8 +132,8 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
         StudyStage(
             "donors",
             (_cli(
-                "donors", *logs, "--scenarios", scenarios, "--base", policy(recipe.base), *donors, *env,
-                "--out", str(out / "donors"), "--license", "Apache-2.0", *workers,
+                "curate", "donors", *logs, "--scenarios", scenarios, "--base", policy(recipe.base), *donors,
+                *env, "--out", str(out / "donors"), "--license", "Apache-2.0", *workers,
             ),),
             (out / "donors" / "meta" / "roborecover" / "donors.json",),
             (out / "donors",),
@@ -152,7 +152,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
         StudyStage(
             "monitor data",
             (_cli(
-                "monitor-data", "--scenarios", scenarios, *env, "--split-by", "cluster",
+                "detect", "data", "--scenarios", scenarios, *env, "--split-by", "cluster",
                 *continued,
                 "--train-frames", "24000", "--balanced-frames", "2000", "--natural-frames", "6000",
                 "--out", str(out / "monitor_data"), "--license", "Apache-2.0", *workers,
@@ -169,7 +169,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
         StudyStage(
             "monitor metrics",
             (_cli(
-                "eval-monitor", "--monitor", str(monitor / CHECKPOINT),
+                "detect", "evaluate-frames", "--monitor", str(monitor / CHECKPOINT),
                 "--data", str(out / "monitor_data" / "validation_balanced"),
                 "--data", str(out / "monitor_data" / "validation_natural"),
                 "--out", str(out / "monitor_report"),

@@ -1,8 +1,8 @@
-"""How often policies solve LIBERO's tasks from their starts, from what `roborecover collect` has rolled out.
+"""How often policies solve LIBERO's tasks from their starts, from what `curate collect` has rolled out.
 
     P=policies/libero/act
-    roborecover collect --env.type=roborecover_libero --env.obs_type=state --policy.path=$P --name act \\
-      --task 'libero_*' --init-states 0,12 --frames none --out natural/act
+    roborecover curate collect --env.type=roborecover_libero --env.obs_type=state --policy.path=$P \\
+      --name act --task 'libero_*' --init-states 0,12 --frames none --out natural/act
     python -m recipes.libero.initial_success natural/*.work
 """
 

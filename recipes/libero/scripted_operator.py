@@ -3,7 +3,7 @@ completes the task all the same.
 
     python -m recipes.libero.scripted_operator --out OUT --init-states 16-19
 
-Starts `roborecover teleop`'s server and talks to it over its websocket, as the page does. The websocket does
+Starts the server of `curate teleop` and talks to it over its websocket, as the page does. The websocket does
 not carry what the scripted expert has to know of the scene. So the operator steps a simulator of its own with
 the same actions, and its state must equal the server's exactly. It replaces a person where none is available;
 its recordings name it as driver.

@@ -81,7 +81,7 @@ def test_a_report_takes_no_forks(tmp_path):
 def test_tables_and_page(tmp_path):
     rows = [r for s in range(12) for arm in ("continue", "fresh", "rollback:30") for step in (0, 25)
             for r in [fork(s, arm, (s + step + len(arm)) % 3 > 0, step=step)]]  # fmt: skip
-    tables = write_gains(fork_gains(rows), tmp_path, "roborecover fork …")
+    tables = write_gains(fork_gains(rows), tmp_path, "roborecover detect fork …")
     assert [t.name for t in tables] == [
         "fork_gain", "fork_gain_by_step", "fork_gain_by_cell", "fork_gain_by_cell_and_step"
     ]  # fmt: skip
@@ -91,5 +91,5 @@ def test_tables_and_page(tmp_path):
     assert gain_tables(fork_gains(rows)) == tables
     page = (tmp_path / "gain.html").read_text()
     assert "Gain by intervention timing" in page
-    assert "roborecover fork …" in page
+    assert "roborecover detect fork …" in page
     assert (tmp_path / "fork_gain.svg").read_bytes().startswith(b"<?xml")

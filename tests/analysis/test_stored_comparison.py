@@ -54,7 +54,7 @@ def first(tmp_path_factory):
 
 def test_the_report_of_stored_scores_says_the_same(first, tmp_path, capsys):
     again = tmp_path / "again"
-    assert main(["eval-monitor", "--scores", str(first), "--out", str(again)]) == 0
+    assert main(["detect", "evaluate", "--scores", str(first), "--out", str(again)]) == 0
     assert "own threshold" in capsys.readouterr().out
     for name in ("detectors.md", "detectors.json", "tables/detectors.csv"):
         assert (again / name).read_bytes() == (first / name).read_bytes(), name
@@ -66,8 +66,9 @@ def test_the_report_of_stored_scores_says_the_same(first, tmp_path, capsys):
 
 
 def test_scores_go_with_nothing_that_would_run(first, tmp_path, capsys):
-    assert main(["eval-monitor", "--scores", str(first), "--policy", "p", "--out", str(tmp_path / "o")]) == 2
-    assert "--policy does not belong to --scores" in capsys.readouterr().err
+    for name in (["eval-monitor"], ["detect", "evaluate"]):
+        assert main([*name, "--scores", str(first), "--policy", "p", "--out", str(tmp_path / "o")]) == 2
+        assert "--policy does not belong to --scores" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

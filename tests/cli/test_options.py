@@ -32,6 +32,6 @@ def test_options_that_lerobots_parser_reads_are_those_of_the_table():
 
 def test_a_missing_option_is_noticed():
     found = plain(our_options())
-    del found["split"]["--seed"]
-    with pytest.raises(AssertionError, match="split has no --seed any more; where that is meant"):
+    del found["curate split"]["--seed"]
+    with pytest.raises(AssertionError, match="curate split has no --seed any more; where that is meant"):
         compare(found, "ours")

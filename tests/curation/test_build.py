@@ -354,7 +354,7 @@ def whole_build(build, capsys) -> list:
     assert build() == 0
     text = capsys.readouterr().out
     assert ran(text) == ["annotate", "agree", "screen", "validate", "split", "render"]
-    assert f"to publish: roborecover publish {build.root / 'rendered'} --repo-id ORG/NAME" in text
+    assert f"to publish: roborecover dataset publish {build.root / 'rendered'} --repo-id ORG/NAME" in text
     final = read_scenarios(build.root / "split")
     assert 4 <= len(final) <= count
     assert {s.split for s in final} == {"train", "test"}

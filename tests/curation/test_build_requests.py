@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.cli import agree, collect, publish, render, screen, split, validate
-from lerobot_roborecover.cli.main import build_parser
+from lerobot_roborecover.cli.main import command_parser
+from lerobot_roborecover.cli.tree import find_call
 from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
 from lerobot_roborecover.curation.pipeline.paths import BuildPaths
@@ -101,7 +102,9 @@ def words(text: str) -> list[str]:
 
 
 def parsed(command: str, text: str) -> argparse.Namespace:
-    return build_parser().parse_args([command, *words(text)])
+    call = find_call([command, *words(text)])
+    assert call is not None
+    return command_parser(call).parse_args(call.rest)
 
 
 def plain(request: object) -> object:

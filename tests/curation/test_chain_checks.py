@@ -161,7 +161,7 @@ def accepted(line: str) -> list[str]:
     """The command of a line, after its parser has taken it."""
     _, _, command = line.partition("roborecover ")
     argv = shlex.split(command)
-    if argv[0] != "collect":
+    if argv[1] != "collect":
         build_parser().parse_args(argv)
     return argv
 
@@ -183,10 +183,9 @@ def test_every_next_line_is_accepted_by_the_parser_of_its_command(tmp_path, monk
 
     assert main(["split", str(fake_dataset(out / "six", 6)), "--train", "4", "--test", "2"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert accepted(next(line for line in lines if line.startswith("next: ")))[:2] == [
-        "render",
-        str(out / "six"),
-    ]
+    assert accepted(next(line for line in lines if line.startswith("next: ")))[:3] == [
+        "dataset", "render", str(out / "six"),
+    ]  # fmt: skip
 
 
 @pytest.mark.lerobot
@@ -207,7 +206,7 @@ def test_a_build_that_waits_names_a_command_that_is_accepted(tmp_path, monkeypat
     chain = Pipeline(read_config(write(tmp_path / "b.yaml", content)), work, lines.append)
     with pytest.raises(AwaitingAnnotations, match="1 candidate waits for votes") as caught:
         chain.build()
-    assert accepted(str(caught.value).splitlines()[-1])[0] == "annotate"
+    assert accepted(str(caught.value).splitlines()[-1])[:2] == ["curate", "annotate"]
     assert "1 candidate of 1 dataset in" in "\n".join(lines)
     assert [line for line in lines if line.endswith(": runs")][1].startswith("[stage 2 of 7, ")
 
@@ -246,7 +245,7 @@ def test_rendering_ends_in_a_lerobot_dataset_that_knows_what_was_decided(tmp_pat
     assert main(["render", str(source), "--out", str(out), "--frames", "64"]) == 0
     said = capsys.readouterr()
     assert f"2 episodes in {out}" in said.out
-    assert accepted(said.out.splitlines()[-1])[:2] == ["publish", str(out)]
+    assert accepted(said.out.splitlines()[-1])[:3] == ["dataset", "publish", str(out)]
     dataset = LeRobotDataset("lab/x", root=out)
     assert (dataset.num_episodes, dataset.num_frames) == (2, 11)
     assert dataset[3]["observation.image"].shape == (3, 64, 64)
@@ -277,13 +276,13 @@ def test_writing_episodes_says_nothing_of_ffmpegs(tmp_path, capfd, monkeypatch):
 def test_a_commands_output_is_its_own(tmp_path):
     """In a process of its own, as a user runs it; two parts are written and joined."""
     source = write_scenarios(tmp_path / "set", [fake_scenario(i, steps=4) for i in range(11)])
-    argv = ["render", str(source), "--out", str(tmp_path / "out"), "--frames", "64"]
+    argv = ["dataset", "render", str(source), "--out", str(tmp_path / "out"), "--frames", "64"]
     command = [sys.executable, "-m", "lerobot_roborecover.cli.main", *argv]
     environment = {k: v for k, v in os.environ.items() if k not in ("SVT_LOG", "TQDM_DISABLE")}
     done = subprocess.run(command, capture_output=True, env=environment, check=True)
     assert done.stdout.decode().splitlines() == [
         f"11 episodes in {tmp_path / 'out'}",
-        f"next: roborecover publish {tmp_path / 'out'} --repo-id ORG/NAME",
+        f"next: roborecover dataset publish {tmp_path / 'out'} --repo-id ORG/NAME",
     ]
     first, *_, last = done.stderr.decode().strip("\r\n").split("\r")
     assert first.startswith("  0%|")

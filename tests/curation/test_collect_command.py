@@ -1,4 +1,4 @@
-"""`roborecover collect` as a whole: datasets, resumption, policies, refusals; and the real simulators."""
+"""`curate collect` as a whole: datasets, resumption, policies, refusals; and the real simulators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover validate --states`: hashes for sets that have none; nothing else changes."""
+"""`roborecover curate validate --states`: hashes for sets that have none; nothing else changes."""
 
 from __future__ import annotations
 

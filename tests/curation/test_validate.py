@@ -62,7 +62,7 @@ def screening_run(scenario, name: str, trial: int) -> tuple[np.ndarray, bool]:
 
 
 def keep_trials(folder, scenarios, count: int = 3, names=NAMES) -> None:
-    """Trials as `roborecover screen` leaves them."""
+    """Trials as `roborecover curate screen` leaves them."""
     for name in names:
         (folder / name / ACTIONS_FOLDER).mkdir(parents=True)
         lines = []

@@ -1,4 +1,4 @@
-"""`roborecover inspect`: tables, and what one scenario's replay leaves on disk."""
+"""`roborecover dataset inspect`: tables, and what one scenario's replay leaves on disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover publish` against a server on loopback that speaks the Hub's protocol to the real client."""
+"""`dataset publish` against a server on loopback that speaks the Hub's protocol to the real client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roborecover pull`, and whole round trips, against a server on loopback that speaks the Hub's protocol."""
+"""`dataset pull`, and whole round trips, against a server on loopback that speaks the Hub's protocol."""
 
 from __future__ import annotations
 

@@ -56,8 +56,8 @@ def played(monkeypatch):
 def command(dataset, policy, out, *more, detectors=DETECTORS) -> list[str]:
     named = [part for d in detectors for part in ("--detector", d)]
     return [
-        "eval-monitor", "--scenarios", str(dataset), "--policy", str(policy), *named, "--out", str(out),
-        "--alpha", "0.4", "--films", "0", *more,
+        "detect", "evaluate", "--scenarios", str(dataset), "--policy", str(policy), *named,
+        "--out", str(out), "--alpha", "0.4", "--films", "0", *more,
     ]  # fmt: skip
 
 
@@ -140,7 +140,6 @@ def test_one_part_of_a_split_is_fitted_to_and_another_measured_on(dataset, polic
         ((), ("no_progress,keys=observation.images.top",), "the environment gives no observation.images.top"),
         (("--fit-split", "test"), ("state_distance",), "--fit-split test is what is measured on"),
         (("--alpha", "1.5"), ("constant",), "--alpha=1.5: must be above 0 and below 1"),
-        (("--data", "d"), ("constant",), "--data does not belong to --detector"),
         (("--training-data", "nowhere"), ("state_distance",), "nowhere: no LeRobotDataset there"),
     ],
 )
@@ -155,6 +154,20 @@ def test_one_of_the_two_ways_to_measure_is_asked_for(capsys):
     assert "--data is missing. Give --monitor and --data" in capsys.readouterr().err
     assert main(["eval-monitor", "--detector", "constant"]) == 2
     assert "--scenarios is missing" in capsys.readouterr().err
+    assert main(["eval-monitor", "--detector", "constant", "--data", "d"]) == 2
+    assert "--scenarios is missing" in capsys.readouterr().err
+    asked = ["--detector", "constant", "--scenarios", "s", "--policy", "p"]
+    assert main(["eval-monitor", *asked, "--data", "d"]) == 2
+    assert "--data does not belong to --detector" in capsys.readouterr().err
+
+
+def test_a_comparison_needs_detectors_scenarios_and_a_policy(capsys):
+    for argv, missing in (([], "detector"), (["--detector", "constant"], "scenarios")):
+        assert main(["detect", "evaluate", *argv]) == 2
+        assert f"--{missing} is missing. Give --detector, --scenarios" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["detect", "evaluate-frames", "--monitor", "m"])
+    assert "required: --data" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +231,7 @@ def test_forks_that_teach_nothing_are_refused(dataset, policy, forks, tmp_path, 
     with_log = ("--forks", str(forks))
     refused("recovery_gain learns from forks: give --forks LOG")
     refused("no detector learns from forks", *with_log, detectors=("elapsed",))
-    refused("no log there; `roborecover fork --out", "--forks", str(tmp_path))
+    refused("no log there; `roborecover detect fork --out", "--forks", str(tmp_path))
     refused("no arm begins with 'rollback'", *with_log, detectors=("recovery_gain,arm=rollback",))
     refused("in training and in validation", *with_log, "--split", "train")
     refused("Fork its own trials", *with_log, of=save_policy(tmp_path / "other", "diffusion"))

@@ -9,7 +9,7 @@ import re
 
 import pytest
 
-from lerobot_roborecover.cli.main import COMMANDS
+from lerobot_roborecover.cli.tree import find_call
 from tests.support.doc_blocks import PAGES, ROOT, Block, all_blocks, commands
 
 OPTIONS = json.loads((ROOT / "tests" / "cli" / "options.json").read_text())
@@ -45,10 +45,12 @@ def calls():
 
 @pytest.mark.parametrize("words", calls())
 def test_a_command_and_its_options_exist(words):
-    command, *rest = words
-    if command.startswith("-"):
+    if words[0].startswith("-"):
         return
-    assert command in COMMANDS
+    call = find_call(words)
+    assert call is not None
+    assert not call.note, "pages say the new names"
+    command, rest = call.name, call.rest
     ours = OPTIONS["ours"].get(command)
     known = set(OPTIONS["lerobots"][command]) if ours is None else set(ours)
     if ours is None:
@@ -56,7 +58,7 @@ def test_a_command_and_its_options_exist(words):
     for word in rest:
         option = word.split("=")[0]
         if option.startswith("--"):
-            nested = (ours is None or command == "collect") and option.startswith(NESTED)
+            nested = (ours is None or command == "curate collect") and option.startswith(NESTED)
             assert option in known or nested, f"{option}: no option of roborecover {command}"
 
 

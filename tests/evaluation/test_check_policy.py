@@ -1,4 +1,4 @@
-"""`roborecover check-policy`: each mistake it looks for is found, and a sound policy passes."""
+"""`roborecover check policy`: each mistake it looks for is found, and a sound policy passes."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
     capsys.readouterr()
     folder = fake_dataset(tmp_path / "set", 2)
     assert main(["envhub", str(folder), *common]) == 2
-    assert "roborecover publish" in capsys.readouterr().err
+    assert "roborecover dataset publish" in capsys.readouterr().err
     assert main(["envhub", "metaworld_starter", "--repo-id", "no id", "--out", str(tmp_path / "x")]) == 2
     assert "org/name" in capsys.readouterr().err
 

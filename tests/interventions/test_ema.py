@@ -59,7 +59,7 @@ def test_the_average_is_the_defined_one_and_survives_a_reload_in_float32():
 
 
 def write_fake_donors(root: Path, **options) -> Path:
-    """A donor dataset of the fake simulator, as `roborecover donors` writes them."""
+    """A donor dataset of the fake simulator, as `roborecover curate donors` writes them."""
     from lerobot_roborecover.datasets.episodes import to_frame
     from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
     from lerobot_roborecover.platforms import make_simulator

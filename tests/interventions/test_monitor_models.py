@@ -263,8 +263,8 @@ def test_the_small_monitor_reads_what_it_is_told_to(data, tmp_path):
 
 
 @pytest.mark.parametrize("kind", BOTH)
-def test_eval_monitor_measures_held_out_frames_only(kind, data, trained, tmp_path, capsys, monkeypatch):
-    argv = ["eval-monitor", "--monitor", str(final(trained(kind))), "--device", "cpu", "--draws", "50"]
+def test_a_monitor_is_measured_on_held_out_frames_only(kind, data, trained, tmp_path, capsys, monkeypatch):
+    argv = ["detect", "evaluate-frames", "--monitor", str(final(trained(kind))), "--device", "cpu"]
     argv += ["--out", str(tmp_path / "out"), "--data", str(data / NATURAL), "--data", f"b={data / BALANCED}"]
     monkeypatch.setattr(sys, "argv", ["roborecover", *argv])
     assert main(argv) == 0

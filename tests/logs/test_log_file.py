@@ -174,8 +174,8 @@ def test_names_that_differ_visibly_are_accepted(tmp_path):
     [
         ["report", "{log}", "--out", "{out}", "--seed", "-1"],
         ["compare", "{log}", "{log}", "--seed=-1"],
-        ["split", "{out}", "--train", "0.5", "--test", "0.5", "--seed", "-1"],
-        ["check-platform", "fake", "--seed", "-1"],
+        ["curate", "split", "{out}", "--train", "0.5", "--test", "0.5", "--seed", "-1"],
+        ["check", "platform", "fake", "--seed", "-1"],
     ],
 )
 def test_a_negative_seed_is_refused_in_one_line(tmp_path, command, capsys):

@@ -1,4 +1,4 @@
-"""`roborecover check-platform`: what a platform does wrong is a finding, never a traceback."""
+"""`roborecover check platform`: what a platform does wrong is a finding, never a traceback."""
 
 from __future__ import annotations
 

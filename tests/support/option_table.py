@@ -12,8 +12,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.cli import collect
-from lerobot_roborecover.cli.main import build_parser
+from lerobot_roborecover.cli.main import build_parser, command_parser
+from lerobot_roborecover.cli.tree import GROUPS, SPLIT_NAMES, find_call
 
 FILE = Path(__file__).parents[1] / "cli" / "options.json"
 
@@ -23,10 +23,20 @@ type Options = dict[str, dict[str, Any]]
 
 def our_options() -> dict[str, Options]:
     """By command: options that our own parsers read."""
-    (commands,) = (a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    found = {name: _of_parser(parser) for name, parser in commands.choices.items()}
-    found["collect"] = _of_parser(collect.build_parser())
+    found: dict[str, Options] = {}
+    for name, parser in _parsers_of(build_parser()).items():
+        inner = {f"{name} {word}": p for word, p in _parsers_of(parser).items()} if name in GROUPS else {}
+        found |= {name: _of_parser(p) for name, p in (inner or {name: parser}).items()}
+    for name in SPLIT_NAMES:
+        call = find_call([name])
+        assert call is not None
+        found[name] = _of_parser(command_parser(call))
     return {name: options for name, options in found.items() if options}
+
+
+def _parsers_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(commands.choices)
 
 
 def lerobots_options() -> dict[str, Options]:
@@ -51,7 +61,7 @@ def lerobots_options() -> dict[str, Options]:
     check = {name: {"stands_for": long} for name, long in SHORT.items()}
     return {
         "eval": _of_class(RunnerOptions, "--runner.") | _of_class(RecoveryOptions, "--env.") | short,
-        "check-policy": _of_class(CheckOptions, "--check.") | check,
+        "check policy": _of_class(CheckOptions, "--check.") | check,
         "serve": _of_class(ServeConfig, "--"),
         **{
             f"--env.type={ENV_PREFIX}{name}": _of_class(ENV_TYPES[name], "--env.", RecoveryOptions)

@@ -61,7 +61,7 @@ def close_guide(page) -> None:
 
 @contextmanager
 def annotating(dataset, folder, *names: str, port: int = 0, only=None):
-    """`roborecover annotate` as a process; yields it and each annotator's address."""
+    """`roborecover curate annotate` as a process; yields it and each annotator's address."""
     command = [
         sys.executable,
         "-m",

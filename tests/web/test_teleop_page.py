@@ -219,7 +219,7 @@ def test_a_wrong_address_gets_a_page_for_people(visit, out):
         for url in (f"{origin}/", f"{origin}/drive/", f"{origin}/drive/?token=wrong"):
             page, _ = visit(url)
             assert "needs its token" in page.inner_text("h1")
-            assert "roborecover teleop" in page.inner_text("body")
+            assert "roborecover curate teleop" in page.inner_text("body")
         assert "no such page" in visit(f"{origin}/elsewhere")[0].inner_text("body")
         page, _ = visit(address)
         page.goto(f"{origin}/")

@@ -56,7 +56,7 @@ def annotate(
         say: told the progress.
         annotators: names of `LABELERS`.
         votes: folder of all votes; by default inside the dataset.
-        only: a list of candidates to discuss (`roborecover agree --discuss`).
+        only: a list of candidates to discuss (`roborecover curate agree --discuss`).
 
     Raises:
         ScenarioError: a name is none of them, something cannot be read or written, or an annotator is at work

@@ -93,6 +93,6 @@ def read_discussion(path: Path) -> Discussion:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
         raise ScenarioError(
-            f"{path} is not a list written by `roborecover agree --discuss` ({err!r:.200})"
+            f"{path} is not a list written by `roborecover curate agree --discuss` ({err!r:.200})"
         ) from None
     return Discussion(found["round"], listed)

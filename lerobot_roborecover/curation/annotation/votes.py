@@ -294,5 +294,5 @@ def read_votes(folder: Path) -> dict[str, list[dict[str, Any]]]:
     paths = sorted(folder.glob("*.jsonl")) if folder.is_dir() else []
     found = {check_name(p.stem): read_journal(p, SCHEMA_VERSION) for p in paths}
     if not any(found.values()):
-        raise ScenarioError(f"{folder} holds no votes; collect some with `roborecover annotate`")
+        raise ScenarioError(f"{folder} holds no votes; collect some with `roborecover curate annotate`")
     return found

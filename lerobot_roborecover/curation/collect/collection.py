@@ -1,4 +1,4 @@
-"""`roborecover collect`: rollouts from initial states, judged, filmed, and written as a candidate dataset.
+"""`curate collect`: rollouts from initial states, judged, filmed, and written as a candidate dataset.
 
 1. Everything that can be refused is refused before a simulator starts.
 2. Rollouts, through the fast runner; each is a record and a journal's line once it has ended.
@@ -98,7 +98,7 @@ def describe(collected: Collected) -> str:
     lines = [attrition_table(collected.rows)] if collected.rows else []
     if collected.out is not None:
         lines.append(f"\n{pluralize(collected.candidates, 'candidate')} in {collected.out}")
-        lines.append(next_command(["annotate", str(collected.out), "--annotator", "NAME"]))
+        lines.append(next_command(["curate", "annotate", str(collected.out), "--annotator", "NAME"]))
     else:
         lines.append("\nno rollout was kept, so no dataset was written")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The scripted drivers of a platform, for `roborecover collect --expert`."""
+"""The scripted drivers of a platform, for `roborecover curate collect --expert`."""
 
 from __future__ import annotations
 

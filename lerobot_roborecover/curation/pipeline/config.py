@@ -1,4 +1,4 @@
-"""The YAML file of `roborecover build`: the options of every stage, in the words of its command.
+"""The YAML file of `roborecover curate build`: the options of every stage, in the words of its command.
 
 An option that is left out is the command's default. Unknown keys are refused, with what is near.
 """
@@ -23,10 +23,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass
 class CollectPart:
-    """One way in which rollouts come about: options of `roborecover collect`, or a dataset that is there."""
+    """One way in which rollouts come about: options of `curate collect`, or a dataset that is there."""
 
     dataset: str | None = None
-    """A candidate dataset, e.g. of `roborecover teleop`; then nothing else is given."""
+    """A candidate dataset, e.g. of `roborecover curate teleop`; then nothing else is given."""
     policy: str | None = None
     """Folder or Hub id of a checkpoint."""
     expert: str | None = None
@@ -62,7 +62,7 @@ class CollectPart:
 
 @dataclass
 class AnnotatePart:
-    """Options of `roborecover annotate` and `agree`."""
+    """Options of `roborecover curate annotate` and `agree`."""
 
     votes: str | None = None
     """Folder of votes that are there already; by default `OUT/votes`."""
@@ -89,7 +89,7 @@ class PolicyPart:
 
 @dataclass
 class ScreenPart:
-    """Options of `roborecover screen`."""
+    """Options of `roborecover curate screen`."""
 
     policies: list[PolicyPart] = field(default_factory=list)
     trials: int | None = None
@@ -108,7 +108,7 @@ class ScreenPart:
 
 @dataclass
 class ValidatePart:
-    """Options of `roborecover validate`."""
+    """Options of `roborecover curate validate`."""
 
     runs: int | None = None
     seed: int | None = None
@@ -126,7 +126,7 @@ class ValidatePart:
 
 @dataclass
 class SplitPart:
-    """Options of `roborecover split`."""
+    """Options of `roborecover curate split`."""
 
     sizes: dict[str, float] = field(default_factory=dict)
     """By split: counts, or fractions."""
@@ -138,7 +138,7 @@ class SplitPart:
 
 @dataclass
 class RenderPart:
-    """Options of `roborecover render`."""
+    """Options of `roborecover dataset render`."""
 
     frames: int | None = None
     workers: int | None = None
@@ -147,7 +147,7 @@ class RenderPart:
 
 @dataclass
 class PublishPart:
-    """Options of `roborecover publish`."""
+    """Options of `roborecover dataset publish`."""
 
     repo_id: str = ""
     version: str | None = None

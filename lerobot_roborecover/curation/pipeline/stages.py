@@ -314,7 +314,7 @@ class Pipeline:
             waiting = self._open()
         if not waiting:
             return
-        base = ["annotate", str(self.places.candidates), "--votes", str(self.places.votes)]
+        base = ["curate", "annotate", str(self.places.candidates), "--votes", str(self.places.votes)]
         base += ["--annotator", "NAME"]
         if waiting.get("waiting"):
             several = waiting["waiting"] != 1

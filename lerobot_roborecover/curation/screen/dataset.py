@@ -226,7 +226,7 @@ def describe(request: ScreenRequest, made: Screening) -> str:
 def validate_next(out: Path, trials: Path) -> list[str]:
     """Arguments of the `validate` that follows, which needs the original frames of every scenario: those that
     the dataset holds, or else the candidates'."""
-    argv = ["validate", str(out), "--trials-folder", str(trials)]
+    argv = ["curate", "validate", str(out), "--trials-folder", str(trials)]
     store = FrameStore(out)
     if any(s.id not in store for s in read_scenarios(out)):
         argv += ["--candidates", "CANDIDATES"]

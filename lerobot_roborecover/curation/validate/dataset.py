@@ -115,7 +115,9 @@ def describe(request: ValidationRequest, made: Validation) -> str:
             format_validation(made.replays, made.decisions, request.rule) + "\n",
             attrition_table(count_stages(read_decisions(request.out))),
             f"\n{request.out}\nlook at {made.page}, worst first; --reject ID --reason TEXT takes one out",
-            next_command(["split", str(request.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]),
+            next_command(
+                ["curate", "split", str(request.out), "--train", "0.8", "--test", "0.2", "--out", "SPLIT"]
+            ),
         )
     )
 
@@ -123,7 +125,7 @@ def describe(request: ValidationRequest, made: Validation) -> str:
 def reject_next(request: ValidationRequest) -> list[str]:
     """Arguments of the same validation with one scenario rejected."""
     rule = request.rule
-    argv = ["validate", str(request.dataset), "--trials-folder", str(request.trials_folder)]
+    argv = ["curate", "validate", str(request.dataset), "--trials-folder", str(request.trials_folder)]
     argv += [w for path in request.candidates for w in ("--candidates", str(path))]
     argv += [w for option in request.env for w in ("--env", option)]
     argv += ["--runs", str(rule.runs), "--seed", str(rule.seed)]

@@ -44,8 +44,8 @@ def read_screening(folder: Path) -> dict[tuple[str, str], list[tuple[str, Policy
     logs = sorted(folder.glob(f"*/{TRIALS_FILE}"))
     if not logs:
         raise ScenarioError(
-            f"{folder} holds no trials (NAME/{TRIALS_FILE}); name the folder that roborecover screen kept "
-            "them in, usually OUT.trials"
+            f"{folder} holds no trials (NAME/{TRIALS_FILE}); name the folder that roborecover curate screen "
+            "kept them in, usually OUT.trials"
         )
     for log in logs:
         for trial in read_trials(log.parent):

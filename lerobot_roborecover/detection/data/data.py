@@ -133,7 +133,7 @@ def check_disjoint(train: Iterable[ScenarioLink], validation: Iterable[ScenarioL
             raise ScenarioError(
                 f"{what}: {len(shared)} scenarios are in training and in validation, e.g. {shared[0]!r}; a "
                 "monitor is not measured on scenarios that it was trained on. Make the data again with "
-                "`roborecover monitor-data`, or name another dataset"
+                "`roborecover detect data`, or name another dataset"
             )
 
 

@@ -38,7 +38,7 @@ def judge_dataset(
 
     Args:
         monitor: loaded with `monitor_loading.load_monitor`.
-        root: folder of a dataset that `roborecover monitor-data` made.
+        root: folder of a dataset that `roborecover detect data` made.
         num_workers: processes that read frames.
         on_training_scenarios: measure also what the monitor was trained on.
         on_batch: told how many frames are done of how many.
@@ -52,7 +52,7 @@ def judge_dataset(
     found = read_trajectories(root)
     if found.kind != "monitor":
         raise ScenarioError(
-            f"{root} holds {found.kind}; a monitor is measured on `roborecover monitor-data`'s frames"
+            f"{root} holds {found.kind}; a monitor is measured on `roborecover detect data`'s frames"
         )
     if not on_training_scenarios:
         check_held_out(monitor, found)

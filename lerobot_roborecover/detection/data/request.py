@@ -1,4 +1,4 @@
-"""From policies and a scenario set to the monitor's datasets: what `roborecover monitor-data` does."""
+"""From policies and a scenario set to the monitor's datasets: what `roborecover detect data` does."""
 
 from __future__ import annotations
 

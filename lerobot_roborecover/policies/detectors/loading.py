@@ -57,7 +57,7 @@ def load_detector(
 
     Args:
         what: one of `KINDS` with its options (`constant,rate=0.02`), or a checkpoint, folder or Hub id: a
-            monitor, a detector that `roborecover eval-monitor` saved, or a reward model of LeRobot's
+            monitor, a detector that `roborecover detect evaluate` saved, or a reward model of LeRobot's
             (`PATH,lag=15`).
         device: where it runs.
         revision: of a Hub id.
@@ -114,7 +114,8 @@ def check_needs(
     for key, feature in needs.features.items():
         if key not in features:
             remedy = (
-                "Use --env.obs_type with pictures (--env obs_type=... of eval-monitor), or set its image_key"
+                "Use --env.obs_type with pictures (--env obs_type=... of detect evaluate), or set "
+                "its image_key"
                 if key.startswith("observation.image")
                 else "See --env.obs_type, or name other keys (keys=...)"
             )
@@ -131,7 +132,7 @@ def check_needs(
     if needs.truth and needs.truth not in truths:
         raise MonitorError(
             f"{name} needs to know the {needs.truth.replace('_', ' ')}, which is unknown while a trial "
-            "runs; it can be measured (`roborecover eval-monitor --detector oracle`), not used"
+            "runs; it can be measured (`roborecover detect evaluate --detector oracle`), not used"
         )
     if needs.of_policy:
         if probe is None:

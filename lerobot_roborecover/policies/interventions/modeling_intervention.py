@@ -176,12 +176,12 @@ def _monitor(config: MonitorConfig, device: str, features: dict, probe: PolicyPr
         settings: Any = detector.config if isinstance(detector, DetectorRewardModel) else detector.options
         if not getattr(detector, "fitted", True):
             raise OptionError(
-                f"{option}: has not been fitted; `roborecover eval-monitor --detector` fits and saves it"
+                f"{option}: has not been fitted; `roborecover detect evaluate --detector` fits and saves it"
             )
         if settings.threshold is None:
             raise OptionError(
                 f"{option}: has no threshold, and would never trigger. Give --policy.monitor.threshold, or "
-                "the folder that `roborecover eval-monitor --detector` saved, which has one"
+                "the folder that `roborecover detect evaluate --detector` saved, which has one"
             )
     missing = sorted(set(detector.needs.features) - set(features)) if features else []
     if missing and isinstance(detector, MonitorDetector):

@@ -34,7 +34,7 @@ class AnnotateConfig:
     seed: int = 0
     """Of the queues' order."""
     only: Path | None = None
-    """A list of candidates to discuss (`roborecover agree --discuss`)."""
+    """A list of candidates to discuss (`roborecover curate agree --discuss`)."""
     examples: bool = True
     """Render the guide's example frames where the dataset holds none."""
 

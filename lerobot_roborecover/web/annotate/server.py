@@ -85,7 +85,9 @@ class Handlers:
         """
         name = request.path_params["annotator"]
         annotator = self.study.annotators.get(name)
-        check_token(request, name, None if annotator is None else annotator.token, "roborecover annotate")
+        check_token(
+            request, name, None if annotator is None else annotator.token, "roborecover curate annotate"
+        )
         assert annotator is not None
         return annotator
 

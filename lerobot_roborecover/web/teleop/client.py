@@ -30,7 +30,7 @@ class Client:
     """One driver, one thing at a time.
 
     Args:
-        address: as `roborecover teleop` prints it, with the token.
+        address: as `roborecover curate teleop` prints it, with the token.
         pictures: receive images too (`frames`); without them nothing is rendered for this client.
         timeout_s: how long one answer may take; a task's first start compiles it.
 
@@ -50,7 +50,7 @@ class Client:
         except (OSError, WebSocketException, ValueError) as err:
             raise ScenarioError(
                 f"{parts.scheme}://{parts.netloc}{parts.path} cannot be driven: {err}. Give the address, "
-                "with its token, that `roborecover teleop` has printed"
+                "with its token, that `roborecover curate teleop` has printed"
             ) from None
         self._timeout_s = timeout_s
         self._next = 1

@@ -101,7 +101,7 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
                     sockets=[listener]
                 )
             except KeyboardInterrupt:
-                say("stopped; writing the dataset. Ctrl-C leaves that for `roborecover teleop --write`")
+                say("stopped; writing the dataset. Ctrl-C leaves it to `roborecover curate teleop --write`")
             finally:
                 if mouse is not None:
                     mouse.stop()

@@ -44,7 +44,7 @@ def make_app(cockpit: TeleopApp) -> Any:
     """The application."""
 
     async def page(request: Request) -> Response:
-        check_token(request, NAME, cockpit.token, "roborecover teleop")
+        check_token(request, NAME, cockpit.token, "roborecover curate teleop")
         if "token" in request.query_params:
             return with_cookie(request, NAME)
         return _PAGE.response(request.path_params.get("file", ""))
@@ -61,7 +61,7 @@ def make_app(cockpit: TeleopApp) -> Any:
 
     async def socket(websocket: WebSocket) -> None:
         try:
-            check_token(websocket, NAME, cockpit.token, "roborecover teleop")
+            check_token(websocket, NAME, cockpit.token, "roborecover curate teleop")
         except Refusal as err:
             await websocket.close(1008, err.message)
             return

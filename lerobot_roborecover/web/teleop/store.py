@@ -91,7 +91,8 @@ class Store:
             raise ScenarioError(f"{folder} cannot be written: {err}. Name another dataset") from err
         except InUseError:
             raise ScenarioError(
-                f"{folder} is in use by another `roborecover teleop`; stop that one, or name another dataset"
+                f"{folder} is in use by another `roborecover curate teleop`; stop that one, or "
+                "name another dataset"
             ) from None
 
     def paths(self) -> list[Path]:

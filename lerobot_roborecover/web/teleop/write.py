@@ -47,7 +47,7 @@ def check_open(dataset: Path) -> None:
     if not dataset.exists() or not any(dataset.iterdir()):
         return
     if not recordings_folder(dataset).is_dir():
-        raise ScenarioError(f"{dataset} was not made by `roborecover teleop`; name a new folder")
+        raise ScenarioError(f"{dataset} was not made by `roborecover curate teleop`; name a new folder")
     later = {d.stage for d in read_decisions(dataset)} - {"collect"} if _has_decisions(dataset) else set()
     votes = votes_folder(dataset, None)
     if later or (votes.is_dir() and any(votes.iterdir())):
@@ -140,7 +140,7 @@ def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, fi
         (_as_candidate(recorded, simulator, film) for recorded in recordings),
         fps=round(simulator.control_hz),
         versions=versions,
-        description="Driven by hand with `roborecover teleop`.",
+        description="Driven by hand with `roborecover curate teleop`.",
     )
 
 

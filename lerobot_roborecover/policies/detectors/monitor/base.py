@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 TASK = "task"
 """LeRobot's batch key of the language instructions."""
-_NO_LABELS = f"the dataset has no column {REWARD}; make one with `roborecover monitor-data`"
+_NO_LABELS = f"the dataset has no column {REWARD}; make one with `roborecover detect data`"
 TRAINED_ON_FILE = "monitor_training.json"
 """Beside the weights: which scenarios the training set held, so that no evaluation uses them again."""
 
@@ -113,7 +113,7 @@ class MonitorRewardModel(PreTrainedRewardModel):
         if not ((labels == 0) | (labels == 1)).all():
             raise MonitorError(
                 f"column {REWARD} holds {labels[(labels != 0) & (labels != 1)][0].item():g}; a monitor's "
-                "labels are 0 and 1. Make the dataset with `roborecover monitor-data`"
+                "labels are 0 and 1. Make the dataset with `roborecover detect data`"
             )
         return labels
 
@@ -232,7 +232,7 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
 
 
 def _scenarios_of(dataset_meta: Any) -> dict[str, Any]:
-    """Scenarios of a dataset that `roborecover monitor-data` made; empty for any other."""
+    """Scenarios of a dataset that `roborecover detect data` made; empty for any other."""
     from lerobot_roborecover.datasets.schema import FOLDER
     from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, read_trajectories
 

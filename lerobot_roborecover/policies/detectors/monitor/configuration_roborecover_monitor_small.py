@@ -36,7 +36,7 @@ class RoboRecoverMonitorSmallConfig(RewardModelConfig):
     state_noise: float = 0.0
     """Standard deviation of noise on normalised vectors during training."""
     threshold: float = 0.5
-    """Score above which the answer is 1; `roborecover eval-monitor` can propose another."""
+    """Score above which the answer is 1; `roborecover detect evaluate` can propose another."""
     max_batch: int = 1024
     """Frames judged at once."""
     learning_rate: float = 1e-3
