@@ -1,4 +1,4 @@
-"""Text from logs, made safe for what it is written into. HTML is escaped by Jinja (`analysis/page.py`).
+"""Text from logs, made safe for what it is written into. HTML is escaped by Jinja (`analysis/pages/page.py`).
 
 Names of policies, scenarios and tasks come from whoever made a log; none may become markup or a formula.
 """

@@ -7,9 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import RowsError, rsr, scenario_rates
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
-from lerobot_roborecover.analysis.style import (
+from lerobot_roborecover.analysis.figures.style import (
     LINE,
     Figure,
     Plot,
@@ -21,6 +19,8 @@ from lerobot_roborecover.analysis.style import (
     marker,
     short,
 )
+from lerobot_roborecover.analysis.stats.estimators import RowsError, rsr, scenario_rates
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Start

@@ -17,22 +17,22 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis import published
-from lerobot_roborecover.analysis.arms import Arm, arm_of, stopped
-from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.first_states import with_first_states
-from lerobot_roborecover.analysis.intervals import UNDEFINED, Estimate
-from lerobot_roborecover.analysis.labels import tell_settings_apart
 from lerobot_roborecover.analysis.logs import clock_of
-from lerobot_roborecover.analysis.macro import MacroCells, cells_of, macro_9_estimates, macro_estimates
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.panel import Panel, make_panel
-from lerobot_roborecover.analysis.resampling import resample
 from lerobot_roborecover.analysis.results import Options
-from lerobot_roborecover.analysis.runs import method_rate, run_rates
-from lerobot_roborecover.analysis.soundness import barred_arms
-from lerobot_roborecover.analysis.units import WORDS
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.stats.arms import Arm, arm_of, stopped
+from lerobot_roborecover.analysis.stats.contrasts import Contrast, contrasts
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.intervals import UNDEFINED, Estimate
+from lerobot_roborecover.analysis.stats.labels import tell_settings_apart
+from lerobot_roborecover.analysis.stats.macro import MacroCells, cells_of, macro_9_estimates, macro_estimates
+from lerobot_roborecover.analysis.stats.panel import Panel, make_panel
+from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.runs import method_rate, run_rates
+from lerobot_roborecover.analysis.stats.soundness import barred_arms
+from lerobot_roborecover.analysis.stats.units import WORDS
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
 from lerobot_roborecover.logs.policy_settings import settings_of_method
 from lerobot_roborecover.logs.row import TrialRow

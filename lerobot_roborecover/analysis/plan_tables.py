@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_roborecover.analysis.power import Plan, PowerAssumptions, detectable
-from lerobot_roborecover.analysis.style import (
+from lerobot_roborecover.analysis.figures.style import (
     DASHES,
     LINE,
     SOFT,
@@ -19,6 +18,7 @@ from lerobot_roborecover.analysis.style import (
     colour,
     drawing,
 )
+from lerobot_roborecover.analysis.stats.power import Plan, PowerAssumptions, detectable
 from lerobot_roborecover.analysis.tables import Column, Table
 
 

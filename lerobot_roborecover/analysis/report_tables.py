@@ -6,11 +6,13 @@ import math
 from collections import Counter
 
 from lerobot_roborecover.analysis import published
-from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
 from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions, task_gains
-from lerobot_roborecover.analysis.groups import Group, group_rates, source_matrix
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.macro import (
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.runs_tables import runs_tables
+from lerobot_roborecover.analysis.stats.crossfit import oracle, profile_difference
+from lerobot_roborecover.analysis.stats.groups import Group, group_rates, source_matrix
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.analysis.stats.macro import (
     MACRO_9,
     PAPER_CELLS,
     cells_of,
@@ -18,16 +20,14 @@ from lerobot_roborecover.analysis.macro import (
     macro_estimates,
     percentile_macro,
 )
-from lerobot_roborecover.analysis.ranking import rank_agreement
-from lerobot_roborecover.analysis.resampling import masked_mean
-from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.runs_tables import runs_tables
+from lerobot_roborecover.analysis.stats.ranking import rank_agreement
+from lerobot_roborecover.analysis.stats.resampling import masked_mean
+from lerobot_roborecover.analysis.stats.timing import FRACTIONS, budget_estimates, median_steps
+from lerobot_roborecover.analysis.stats.trial_metrics import trial_metrics
+from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
+from lerobot_roborecover.analysis.stats.variance import variance_split
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
-from lerobot_roborecover.analysis.timing import FRACTIONS, budget_estimates, median_steps
-from lerobot_roborecover.analysis.trial_metrics import trial_metrics
-from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
-from lerobot_roborecover.analysis.variance import variance_split
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.scenario import Outcome, Start
 
 _NAN = float("nan")

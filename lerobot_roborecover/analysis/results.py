@@ -9,17 +9,19 @@ from itertools import combinations
 
 import numpy as np
 
-from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.complete_subset import Compared, compared
-from lerobot_roborecover.analysis.contrasts import Contrast, adjusted, contrasts
-from lerobot_roborecover.analysis.costs import InterventionCost, intervention_cost
-from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
 from lerobot_roborecover.analysis.logs import Study
-from lerobot_roborecover.analysis.panel import Panel, make_panel
-from lerobot_roborecover.analysis.ranking import StartRates
-from lerobot_roborecover.analysis.resampling import SEED, Resampling, masked_mean, resample
-from lerobot_roborecover.analysis.runs import (
+from lerobot_roborecover.analysis.sequential_pairs import recorded_pairs, watched_pair
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.complete_subset import Compared, compared
+from lerobot_roborecover.analysis.stats.contrasts import Contrast, adjusted, contrasts
+from lerobot_roborecover.analysis.stats.costs import InterventionCost, intervention_cost
+from lerobot_roborecover.analysis.stats.estimators import DRAWS, RowsError
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate
+from lerobot_roborecover.analysis.stats.panel import Panel, make_panel
+from lerobot_roborecover.analysis.stats.ranking import StartRates
+from lerobot_roborecover.analysis.stats.resampling import SEED, Resampling, masked_mean, resample
+from lerobot_roborecover.analysis.stats.runs import (
     MethodContrast,
     MethodRate,
     RunRates,
@@ -27,11 +29,9 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
-from lerobot_roborecover.analysis.sequential_pairs import recorded_pairs, watched_pair
-from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
-from lerobot_roborecover.analysis.soundness import barred_arms
-from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.stats.soundness import barred_arms
+from lerobot_roborecover.analysis.stats.units import WORDS, ResamplingUnit, initial_unit
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.logs.sequential_record import SequentialRecord
 from lerobot_roborecover.scenario import Start

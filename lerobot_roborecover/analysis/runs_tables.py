@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.style import (
+from lerobot_roborecover.analysis.figures.style import (
     LINE,
     PAPER,
     Figure,
@@ -20,8 +19,9 @@ from lerobot_roborecover.analysis.style import (
     row_height,
     short,
 )
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_RUNS
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
-from lerobot_roborecover.analysis.verdicts import LEAST_RUNS
 
 
 def runs_tables(results: Results) -> list[Table]:

@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 def _side_by_side(args: argparse.Namespace) -> int:
     """Detectors on a policy's trials."""
     from lerobot_roborecover._version import __version__
-    from lerobot_roborecover.analysis.detection_page import (
+    from lerobot_roborecover.analysis.pages.detection import (
         DETECTION_FILES,
         detection_text,
         write_detection_report,
@@ -186,7 +186,7 @@ def _side_by_side(args: argparse.Namespace) -> int:
 
 def _from_scores(args: argparse.Namespace) -> int:
     """Reports a finished comparison of detectors again."""
-    from lerobot_roborecover.analysis.detection_page import (
+    from lerobot_roborecover.analysis.pages.detection import (
         DETECTION_FILES,
         detection_text,
         write_detection_report,
@@ -208,15 +208,15 @@ def _from_scores(args: argparse.Namespace) -> int:
 def _on_frames(args: argparse.Namespace) -> int:
     """One monitor on labelled frames."""
     from lerobot_roborecover._version import __version__
-    from lerobot_roborecover.analysis.monitor_curves import choose_threshold
-    from lerobot_roborecover.analysis.monitor_page import (
+    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.analysis.pages.monitor import (
         MONITOR_FILES,
         Measured,
         summary_text,
         write_monitor_report,
     )
-    from lerobot_roborecover.analysis.monitor_report import monitor_report
-    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.analysis.stats.monitor_curves import choose_threshold
+    from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
     from lerobot_roborecover.detection.data.judging import judge_dataset
     from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
     from lerobot_roborecover.policies.detectors.monitor_interface import TrainedMonitor

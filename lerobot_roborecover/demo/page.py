@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot_roborecover.analysis.logs import Study, read_study
-from lerobot_roborecover.analysis.report import Extras, write_report
+from lerobot_roborecover.analysis.pages.report import Extras, write_report
 from lerobot_roborecover.analysis.results import Options, analyse
 from lerobot_roborecover.logs.row import TrialRow
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.analysis.escape import csv_text, latex, markdown, markdown_alt
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.logs.merge import merge

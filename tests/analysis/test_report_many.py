@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_roborecover.analysis import report_tables
-from lerobot_roborecover.analysis.figures import paired_differences
+from lerobot_roborecover.analysis.figures.rates import paired_differences
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.results import MOST_PAIRS, Options, analyse
 from tests.support.trial_rows import policy_rows, write_log
