@@ -11,7 +11,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard
+from lerobot_roborecover.analysis.board import Board, Entry
+from lerobot_roborecover.analysis.leaderboard import Leaderboard
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.datasets.benchmark import TASKS

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.estimators import (
+    UNDERPOWERED_BELOW,
     RowsError,
     ScenarioRates,
     initial_rate_units,
@@ -19,9 +20,6 @@ from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, estima
 from lerobot_roborecover.analysis.stats.macro import MACRO_9, MacroCells, macro_cells, macro_of_scenarios
 from lerobot_roborecover.analysis.stats.units import WORDS, default_unit
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage, Start
-
-UNDERPOWERED_BELOW = 10
-"""Scenarios of a cell below which its numbers are marked."""
 
 _TITLES = {
     Start.INITIAL: "Initial-state success",

@@ -77,8 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints the plan, and writes it where asked."""
+    from lerobot_roborecover.analysis.figures.plan import detectable_figure
     from lerobot_roborecover.analysis.figures.style import png_of, svg_of
-    from lerobot_roborecover.analysis.plan_tables import detectable_figure, detectable_table, plan_table
+    from lerobot_roborecover.analysis.plan_tables import detectable_table, plan_table
     from lerobot_roborecover.analysis.stats.power import plans
     from lerobot_roborecover.analysis.tables import to_csv, to_markdown, to_text
     from lerobot_roborecover.utils.atomic_io import atomic_write

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.report_tables import overall
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.policy_tables import overall
 from lerobot_roborecover.analysis.stats.arms import Arm
 from lerobot_roborecover.analysis.stats.contrasts import holm
 from lerobot_roborecover.analysis.stats.crossfit import gain_over, oracle, profile_difference

@@ -15,7 +15,7 @@ from lerobot_roborecover.analysis.escape import csv_text, latex, markdown, markd
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.cli.main import main

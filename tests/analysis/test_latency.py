@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.analysis.latency import latency_figure, latency_rates, latency_table
+from lerobot_roborecover.analysis.figures.latency import latency_figure
+from lerobot_roborecover.analysis.latency import latency_rates, latency_table
 from lerobot_roborecover.analysis.logs import clock_of, read_study
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.tables import to_text

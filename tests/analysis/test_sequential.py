@@ -15,10 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import Study, read_study
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.sequential_pairs import watched_pair
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
 from lerobot_roborecover.analysis.stats.arms import Arm

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.figures.runs import runs_figure
 from lerobot_roborecover.analysis.figures.style import (
     HEAT,
     INK,
@@ -29,9 +30,8 @@ from lerobot_roborecover.analysis.figures.style import (
     short,
 )
 from lerobot_roborecover.analysis.figures.trials import interventions, mosaic, oracle_bars, time_to_recover
-from lerobot_roborecover.analysis.report_tables import initial_estimates
+from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.runs_tables import runs_figure
 from lerobot_roborecover.analysis.stats.groups import group_rates, source_matrix
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 

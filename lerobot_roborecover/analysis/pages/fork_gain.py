@@ -6,8 +6,9 @@ from pathlib import Path
 
 from lerobot_roborecover.analysis.figures.fork_gain import gain_by_step
 from lerobot_roborecover.analysis.figures.style import render
+from lerobot_roborecover.analysis.fork_tables import gain_tables
 from lerobot_roborecover.analysis.pages.page import picture, render_page
-from lerobot_roborecover.analysis.stats.fork_gain import ForkGains, gain_tables
+from lerobot_roborecover.analysis.stats.fork_gain import ForkGains
 from lerobot_roborecover.analysis.tables import Table, to_csv, to_markdown
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.outputs import claim_page

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_roborecover.analysis import published
-from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard, as_json, ranks, separated
+from lerobot_roborecover.analysis.board import Board, Entry, ranks, separated
+from lerobot_roborecover.analysis.leaderboard import Leaderboard, as_json
 from lerobot_roborecover.analysis.pages.page import render_page
 from lerobot_roborecover.analysis.stats.macro import MACRO_9
 from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict

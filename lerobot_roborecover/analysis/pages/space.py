@@ -8,7 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.analysis.leaderboard import Board, BoardTrials, Leaderboard
+from lerobot_roborecover.analysis.board import Board, BoardTrials
+from lerobot_roborecover.analysis.leaderboard import Leaderboard
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo, check_scenarios, gallery_values, make_cards
 from lerobot_roborecover.analysis.pages.leaderboard import write_leaderboard
 from lerobot_roborecover.analysis.pages.media import find_media

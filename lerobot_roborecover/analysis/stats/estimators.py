@@ -24,6 +24,8 @@ from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.scenario import Outcome, Start
 
 DRAWS = 10_000
+UNDERPOWERED_BELOW = 10
+"""Scenarios of a cell below which its numbers are marked."""
 
 
 class RowsError(RoboRecoverError, ValueError):

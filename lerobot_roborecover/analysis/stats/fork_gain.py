@@ -9,7 +9,7 @@ which one of the two is invalid are left out and counted.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,14 +18,11 @@ import numpy as np
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.resampling import resample
 from lerobot_roborecover.analysis.stats.units import (
-    ESTIMAND,
     ResamplingUnit,
     default_unit,
     initial_unit,
     unit_labels,
 )
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
-from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, ScenarioError, Start
 
@@ -203,51 +200,3 @@ def fork_gains(rows: Iterable[TrialRow], unit: ResamplingUnit | None = None) -> 
         initial = any(p.row.start == Start.INITIAL for p in pairs)
         unit = initial_unit(None) if initial else default_unit(platform)
     return ForkGains(tuple(pairs), arms, len(others) - len(pairs), (reproduced, checked), unit)
-
-
-_NUMBERS = (
-    Column("Forks", "count"), Column("Scenarios", "count"), Column("Continue %", "percent"),
-    Column("Intervene %", "percent"), Column("Gain, points", "points"),
-)  # fmt: skip
-
-
-def gain_tables(gains: ForkGains) -> list[Table]:
-    """All forks, by step, by cell, and by both."""
-    arms, steps, cells = gains.arms, gains.steps, gains.cells
-    notes = (
-        "Gain: success when somebody steps in, less success when the same policy continues from the same "
-        "step of the same trial. Every scenario counts the same; intervals (95 %) speak of "
-        f"{ESTIMAND[gains.unit]}. They are not adjusted for the number of rows: a row that was picked by its "
-        "gain is to be tried on other scenarios.",
-        f"Forks left out because they, or their continuation, are invalid: {gains.unpaired}.",
-    )
-    return [
-        _table(gains, "fork_gain", "Recovery gain", {"Arm": arms}, notes),
-        _table(gains, "fork_gain_by_step", "By step of the trial", {"Arm": arms, "Step": steps}),
-        _table(gains, "fork_gain_by_cell", "By cell", {"Arm": arms, "Cell": cells}),
-        _table(
-            gains, "fork_gain_by_cell_and_step", "By cell and step",
-            {"Arm": arms, "Cell": cells, "Step": steps},
-        ),
-    ]  # fmt: skip
-
-
-def _table(
-    gains: ForkGains, name: str, title: str, by: Mapping[str, Sequence], notes: tuple[str, ...] = ()
-) -> Table:
-    rows, sparse = [], set()
-    combined: list[tuple] = [()]
-    for values in by.values():
-        combined = [(*head, value) for head in combined for value in values]
-    for head in combined:
-        chosen = dict(zip(by, head, strict=True))
-        forks, scenarios, *estimates = gains.of(
-            chosen["Arm"], step=chosen.get("Step"), cell=chosen.get("Cell")
-        )
-        if not forks:
-            continue
-        if scenarios < UNDERPOWERED_BELOW:
-            sparse.add(len(rows))
-        rows.append((*head, forks, scenarios, *estimates))
-    columns = [Column(title, "count" if title == "Step" else "text") for title in by]
-    return Table(name, title, (*columns, *_NUMBERS), tuple(rows), notes, frozenset(sparse))

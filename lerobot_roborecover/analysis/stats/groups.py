@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.crossfit import gain_over
+from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.analysis.stats.resampling import Resampling
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
 
 
 @dataclass(frozen=True)

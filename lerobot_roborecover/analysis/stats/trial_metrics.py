@@ -14,7 +14,6 @@ import numpy as np
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.analysis.stats.resampling import Resampling
-from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.logs.row import TrialRow
 
 NONE = float("nan")
@@ -121,16 +120,3 @@ def metric_estimates(panel: Panel, metric: Metric, draws: Resampling) -> list[Es
     """
     values = scenario_means(panel, metric)
     return draws.rates(values) if metric.share else draws.percentile(values)
-
-
-def trial_metrics(panel: Panel, draws: Resampling, metrics: tuple[Metric, ...] = METRICS) -> Table:
-    """Every policy's mean of every metric."""
-    metrics = tuple(m for m in metrics if not (m.optional and np.isnan(scenario_means(panel, m)).all()))
-    columns = [metric_estimates(panel, metric, draws) for metric in metrics]
-    return Table(
-        "trial_metrics",
-        "Measured in the trials",
-        (Column("Policy"), *(Column(m.title, "percent" if m.share else "number") for m in metrics)),
-        tuple((policy, *(column[p] for column in columns)) for p, policy in enumerate(panel.arms)),
-        tuple(metric.about for metric in metrics),
-    )
