@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 from typing import Protocol as Interface
 
@@ -28,6 +27,7 @@ import numpy as np
 
 from lerobot_roborecover.evaluation.intervention_record import InterventionRecord
 from lerobot_roborecover.evaluation.real_time import LatencyModel, RealTime
+from lerobot_roborecover.evaluation.trial_state import FAILURES, IN_SIMULATOR, TrialState
 from lerobot_roborecover.logs.actions import actions_digest
 from lerobot_roborecover.logs.row import (
     EvalProtocol,
@@ -52,36 +52,6 @@ from lerobot_roborecover.workers.messages import (
 )
 
 SOLVED_THERE = "the task's predicate already holds where the rollback went"
-FAILURES = {
-    "raised": Outcome.SIM_ERROR,
-    "died": Outcome.SIM_ERROR,
-    "hung": Outcome.TIMEOUT,
-    "lost": Outcome.SIM_ERROR,
-}
-"""What a slot's failure makes of its trial, by kind; one that is `lost` is tried elsewhere first."""
-
-
-class TrialState(StrEnum):
-    """Where a trial is."""
-
-    NEW = "new"
-    """Nothing has been asked of anybody."""
-    HANDING_OFF = "handing_off"
-    """A simulator rebuilds its start."""
-    WAITING = "waiting"
-    """It has an observation that the policy has not been asked about."""
-    ASKED = "asked"
-    """The policy infers."""
-    ACTING = "acting"
-    """A simulator executes actions."""
-    GOING_BACK = "going_back"
-    """A simulator is put back to an earlier state."""
-    OVER = "over"
-    """It has an outcome, or was skipped."""
-
-
-IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK)
-"""States that a simulator's reply ends."""
 
 
 @dataclass(frozen=True)
