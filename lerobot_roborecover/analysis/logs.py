@@ -293,7 +293,7 @@ def _check_options(rows: Sequence[TrialRow]) -> None:
 
 def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
     """A remark where policies saw pictures of different quality; a row that says none has LeRobot's own
-    (`platforms.base.chosen_quality`)."""
+    (`platforms.env_options.chosen_quality`)."""
     users: dict[str, str] = {}
     for row in _apart(rows, "options"):
         users.setdefault(str(row.options.get("render_quality", "full")), row.policy)
