@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from lerobot_roborecover.platforms.findings import Check
     from lerobot_roborecover.platforms.starts import Starts
 
-
 ENV_PREFIX = "roborecover_"
 """Of the names under which LeRobot knows our env types."""
 
