@@ -25,10 +25,10 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=200)
     parser.add_argument("--trials", type=int, default=5)
     args = parser.parse_args()
+    from lerobot_roborecover.analysis.analyse import analyse
     from lerobot_roborecover.analysis.logs import read_study
-    from lerobot_roborecover.analysis.report import write_report
+    from lerobot_roborecover.analysis.pages.report import write_report
     from lerobot_roborecover.analysis.report_tables import all_tables
-    from lerobot_roborecover.analysis.results import analyse
     from tests.support.trial_rows import policy_rows, write_log
 
     with tempfile.TemporaryDirectory() as folder:

@@ -27,14 +27,14 @@ from coverage_settings import (
     verdicts,
 )
 
-from lerobot_roborecover.analysis.intervals import (
+from lerobot_roborecover.analysis.stats.intervals import (
     difference_interval,
     rate_interval,
     ratio_interval,
     spread,
 )
-from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
-from lerobot_roborecover.analysis.resampling import resample
+from lerobot_roborecover.analysis.stats.ranking import StartRates, rank_agreement
+from lerobot_roborecover.analysis.stats.resampling import resample
 
 MOST = 6
 """Scenarios of one first state, at most."""

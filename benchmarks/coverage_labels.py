@@ -9,9 +9,9 @@ import numpy as np
 from coverage_settings import SIZES, Line, held, rng_of
 from scipy import special
 
-from lerobot_roborecover.analysis.intervals import rate_interval, spread
-from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames
-from lerobot_roborecover.analysis.monitor_report import monitor_report
+from lerobot_roborecover.analysis.stats.intervals import rate_interval, spread
+from lerobot_roborecover.analysis.stats.monitor import METRICS, MonitorFrames
+from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
 from lerobot_roborecover.curation import agreement
 
 MONITORS = {

@@ -17,23 +17,23 @@ import numpy as np
 from coverage_settings import Line, alike, held, rng_of, scenario_rates
 from scipy import special
 
-from lerobot_roborecover.analysis.intervals import (
+from lerobot_roborecover.analysis.sequential_pairs import watched_pair
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
+from lerobot_roborecover.analysis.stats.intervals import (
     WeightedMean,
     difference_interval,
     difference_p,
     rate_interval,
 )
-from lerobot_roborecover.analysis.resampling import resample
-from lerobot_roborecover.analysis.runs import (
+from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.runs import (
     RunRates,
     crossed_difference,
     crossed_spread,
     hierarchical_bootstrap,
 )
-from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest
-from lerobot_roborecover.analysis.sequential_pairs import watched_pair
-from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, LEAST_RUNS
+from lerobot_roborecover.analysis.stats.sequential import RateSequence, SequentialTest
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, LEAST_RUNS
 
 RUNS = (2, 3, 5, 10)
 BETWEEN = (0.0, 0.3, 0.8)

@@ -15,19 +15,19 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
-from lerobot_roborecover.analysis.contrasts import holm
-from lerobot_roborecover.analysis.crossfit import gain_over, oracle, profile_difference
-from lerobot_roborecover.analysis.intervals import (
+from lerobot_roborecover.analysis.stats.contrasts import holm
+from lerobot_roborecover.analysis.stats.crossfit import gain_over, oracle, profile_difference
+from lerobot_roborecover.analysis.stats.intervals import (
     difference_interval,
     rate_interval,
     ratio_interval,
     spread,
 )
-from lerobot_roborecover.analysis.macro import LEAST_IN_CELL
-from lerobot_roborecover.analysis.panel import Panel, ScenarioLabels
-from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
-from lerobot_roborecover.analysis.resampling import resample
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
+from lerobot_roborecover.analysis.stats.macro import LEAST_IN_CELL
+from lerobot_roborecover.analysis.stats.panel import Panel, ScenarioLabels
+from lerobot_roborecover.analysis.stats.ranking import StartRates, rank_agreement
+from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING
 
 SIZES = (8, 20, 64, 200)
 TRIALS = (1, 5)
@@ -279,7 +279,7 @@ def verdicts(successes: np.ndarray, most: int, error: float = 0.05) -> np.ndarra
 
 
 def sign_flips(differences: np.ndarray) -> np.ndarray:
-    """(samples,) exact p-values as of `analysis.permutation.sign_flip_p`, of many samples at once.
+    """(samples,) exact p-values as of `analysis.stats.permutation.sign_flip_p`, of many samples at once.
 
     The sum of flipped differences has the characteristic function prod cos(t d); its chances follow from
     as many values of t as the sum has values.

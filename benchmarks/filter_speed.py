@@ -29,9 +29,10 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=2000)
     parser.add_argument("--policies", type=int, default=5)
     args = parser.parse_args()
+    from lerobot_roborecover.analysis.analyse import analyse
     from lerobot_roborecover.analysis.logs import read_study
-    from lerobot_roborecover.analysis.report import write_report
-    from lerobot_roborecover.analysis.results import Options, analyse
+    from lerobot_roborecover.analysis.options import Options
+    from lerobot_roborecover.analysis.pages.report import write_report
     from tests.support.browser import open_page
     from tests.support.trial_rows import policy_rows, write_log
 

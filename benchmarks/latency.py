@@ -17,8 +17,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from lerobot_roborecover.analysis.latency import latency_figure, latency_rates, latency_table
-from lerobot_roborecover.analysis.style import png_of, svg_of
+from lerobot_roborecover.analysis.figures.latency import latency_figure
+from lerobot_roborecover.analysis.figures.style import png_of, svg_of
+from lerobot_roborecover.analysis.latency import latency_rates, latency_table
 from lerobot_roborecover.analysis.tables import to_csv, to_text
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.utils.atomic_io import atomic_write

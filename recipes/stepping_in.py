@@ -22,8 +22,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lerobot_roborecover.analysis.fork_gain import fork_gains
-from lerobot_roborecover.analysis.fork_page import write_gains
+from lerobot_roborecover.analysis.pages.fork_gain import write_gains
+from lerobot_roborecover.analysis.stats.fork_gain import fork_gains
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios

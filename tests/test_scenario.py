@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import lerobot_roborecover.scenario as records
+import lerobot_roborecover.rollout as records
 from lerobot_roborecover.curation.collect.starts import make_units
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.logs.row import EvalProtocol, make_row

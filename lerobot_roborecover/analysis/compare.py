@@ -10,19 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.contrasts import Contrast, Share, contributions
-from lerobot_roborecover.analysis.crossfit import Profile, profile_difference
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import Study
-from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.results import Options, Results, analyse
-from lerobot_roborecover.analysis.runs import MethodContrast, MethodRate
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.sequential_plan import keep_plan, recorded_plan
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
+from lerobot_roborecover.analysis.stats.contrasts import Contrast, Share, contributions
+from lerobot_roborecover.analysis.stats.crossfit import Profile, profile_difference
+from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW, RowsError
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.analysis.stats.runs import MethodContrast, MethodRate
+from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict, method_text, verdict_text
 from lerobot_roborecover.analysis.tables import NOT_DEFINED, Column, Table, cell_text, to_text
-from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict, method_text, verdict_text
 from lerobot_roborecover.scenario import Start
 
 _BAR_WIDTH = 41

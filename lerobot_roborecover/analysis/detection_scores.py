@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.detection import ScoredTrial
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 
 MAX_SCORES = 50_000_000
 """Scores of one detector, 400 MB as float64; a set of 359 scenarios has about 100,000."""

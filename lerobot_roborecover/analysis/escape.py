@@ -1,4 +1,4 @@
-"""Escapes text from logs for Markdown, CSV and LaTeX. Jinja escapes HTML (`analysis/page.py`).
+"""Escapes text from logs for Markdown, CSV and LaTeX. Jinja escapes HTML (`analysis/pages/page.py`).
 
 Names of policies, scenarios and tasks in a log are untrusted; none may become markup or a formula.
 """

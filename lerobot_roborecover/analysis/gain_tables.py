@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_roborecover.analysis.contrasts import Contrast, contrasts
-from lerobot_roborecover.analysis.gains import gains_by_group, groups_by_driver
-from lerobot_roborecover.analysis.intervals import UNDEFINED
-from lerobot_roborecover.analysis.ranking import pairs_from_both_starts
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
+from lerobot_roborecover.analysis.stats.contrasts import Contrast, contrasts
+from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.intervals import UNDEFINED
+from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts
+from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
-from lerobot_roborecover.analysis.units import ESTIMAND, ResamplingUnit
 
 _NAN = float("nan")
 

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.resampling import masked_mean
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.soundness import invalid_words, valid_trials
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
+from lerobot_roborecover.analysis.stats.contrasts import Contrast
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.analysis.stats.resampling import masked_mean
+from lerobot_roborecover.analysis.stats.soundness import invalid_words, valid_trials
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.utils.text import pluralize
 
 

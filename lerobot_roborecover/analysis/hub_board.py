@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.board import Board, Entry
 from lerobot_roborecover.analysis.hub_results import rates_of
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard
+from lerobot_roborecover.analysis.leaderboard import Leaderboard
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.datasets.benchmark import TASKS
 from lerobot_roborecover.datasets.load import HUB_ID

@@ -11,9 +11,10 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.leaderboard import Board, Entry, Leaderboard
+from lerobot_roborecover.analysis.board import Board, Entry
+from lerobot_roborecover.analysis.leaderboard import Leaderboard
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.datasets.benchmark import TASKS
 from lerobot_roborecover.datasets.load import HUB_ID
 from lerobot_roborecover.scenario import ScenarioError

@@ -7,20 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import RowsError, rsr, scenario_rates
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
-from lerobot_roborecover.analysis.style import (
-    LINE,
-    Figure,
-    Plot,
-    Width,
-    both,
-    colour,
-    dash,
-    drawing,
-    marker,
-    short,
-)
+from lerobot_roborecover.analysis.stats.estimators import RowsError, rsr, scenario_rates
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
 from lerobot_roborecover.analysis.tables import Column, Table
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Start
@@ -104,41 +92,3 @@ def latency_table(rates: Sequence[LatencyRate], level: float = LEVEL) -> Table:
     )
     notes = (f"Intervals: {100 * level:g} %. hold repeats the last action meanwhile, chunk goes on with it.",)
     return Table("latency", "RSR against latency", columns, rows, notes)
-
-
-def latency_figure(rates: Sequence[LatencyRate], level: float = LEVEL) -> Figure:
-    """RSR against the latency charged; frozen clocks stand at 0, measured ones are in the table alone."""
-    curves: dict[tuple[str, str], list[LatencyRate]] = {}
-    for rate in rates:
-        if rate.meanwhile and not np.isnan(rate.latency_s):
-            curves.setdefault((rate.policy, rate.meanwhile), []).append(rate)
-    for (policy, _), points in curves.items():
-        if all(p.latency_s for p in points):
-            points[:0] = [r for r in rates if r.policy == policy and not r.meanwhile]
-
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
-            plot, axes = subplots(width.inches, 3.4 + 0.24 * len(curves) if width.narrow else 4.2)
-            for k, ((policy, meanwhile), points) in enumerate(curves.items()):
-                x = 1e3 * np.array([p.latency_s for p in points])
-                y = 100 * np.array([[p.rate.value, p.rate.low, p.rate.high] for p in points])
-                name = f"{short(policy, width.names)}, {meanwhile}"
-                style = {"color": colour(k), "ls": dash(k), "marker": marker(k)}
-                axes.plot(x, y[:, 0], lw=2, label=name, **style)
-                axes.fill_between(x, y[:, 1], y[:, 2], color=colour(k), alpha=0.12, lw=0)
-            axes.set(
-                ylim=(0, 100),
-                xlabel="latency of an inference, ms",
-                ylabel=f"RSR, %, {100 * level:g} % interval",
-            )
-            axes.set_xlim(left=0)
-            axes.grid(color=LINE, lw=0.6)
-            plot.legend(loc="outside lower left" if width.narrow else "outside right upper")
-        return plot
-
-    words = "; ".join(
-        f"{policy} ({meanwhile}) "
-        + ", ".join(f"{100 * p.rate.value:.1f} at {1e3 * p.latency_s:g} ms" for p in points)
-        for (policy, meanwhile), points in curves.items()
-    )
-    return Figure("latency", "RSR against latency", f"RSR in per cent: {words}.", *both(draw))

@@ -11,7 +11,10 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
-from lerobot_roborecover.analysis.arms import (
+from lerobot_roborecover.analysis.first_states import with_first_states
+from lerobot_roborecover.analysis.look_alikes import check_names
+from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
+from lerobot_roborecover.analysis.stats.arms import (
     Arm,
     arm_remarks,
     arms_of,
@@ -19,12 +22,9 @@ from lerobot_roborecover.analysis.arms import (
     sequential_remarks,
     stopped,
 )
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.first_states import with_first_states
-from lerobot_roborecover.analysis.fork_gain import FORK
-from lerobot_roborecover.analysis.labels import settings_differences, tell_settings_apart
-from lerobot_roborecover.analysis.look_alikes import check_names
-from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.fork_gain import FORK
+from lerobot_roborecover.analysis.stats.labels import settings_differences, tell_settings_apart
 from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
 from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS
 from lerobot_roborecover.logs.row import TrialRow
@@ -293,7 +293,7 @@ def _check_options(rows: Sequence[TrialRow]) -> None:
 
 def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
     """A remark where policies saw pictures of different quality; a row that says none has LeRobot's own
-    (`platforms.base.chosen_quality`)."""
+    (`platforms.env_options.chosen_quality`)."""
     users: dict[str, str] = {}
     for row in _apart(rows, "options"):
         users.setdefault(str(row.options.get("render_quality", "full")), row.policy)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from itertools import zip_longest
 from unicodedata import category, name, normalize
 
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 
 _LETTERS = str.maketrans(
     "АВЕЅІЈКМНОРСТХУԌԚԜЗаеѕіјорсухһԁԛԝ" + "ΑΒΕΖΗΙΚΜΝΟΡΤΥΧαγινορυ",

@@ -9,14 +9,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.analysis.gallery import check_scenarios
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.logs import Study, read_study
-from lerobot_roborecover.analysis.media import find_clips
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.report import REPORT_FILES, Extras, ReportFiles, write_report
-from lerobot_roborecover.analysis.results import Options, Results, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.gallery import check_scenarios
+from lerobot_roborecover.analysis.pages.media import find_clips
+from lerobot_roborecover.analysis.pages.report import REPORT_FILES, Extras, ReportFiles, write_report
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.utils.outputs import check_page
 
@@ -139,7 +141,7 @@ def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[
         }
         todo = [s for s in wanted if s.id not in frames]
         if gallery.render and todo:
-            from lerobot_roborecover.analysis.pictures import render_frames
+            from lerobot_roborecover.analysis.pages.pictures import render_frames
 
             print(f"rendering {len(todo)} recovery frames ...", file=sys.stderr)
             files, problem = render_frames(todo, out / "frames")

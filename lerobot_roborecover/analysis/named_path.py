@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from unicodedata import normalize
 
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 
 
 def split_named(text: str) -> tuple[str, str]:

@@ -1,24 +1,10 @@
-"""A plan as tables and a figure."""
+"""A plan as tables."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from lerobot_roborecover.analysis.power import Plan, PowerAssumptions, detectable
-from lerobot_roborecover.analysis.style import (
-    DASHES,
-    LINE,
-    SOFT,
-    Figure,
-    Plot,
-    Width,
-    both,
-    colour,
-    drawing,
-)
+from lerobot_roborecover.analysis.stats.power import Plan, PowerAssumptions, detectable
 from lerobot_roborecover.analysis.tables import Column, Table
 
 
@@ -81,59 +67,3 @@ def _tested(level: float, family: int) -> str:
         f"Test: the report's, paired sign flips over scenarios, at {1 - level:.3g} for {pairs}. By "
         "simulation: the exact test on 300 made-up studies of that size, give or take 5."
     )
-
-
-def detectable_figure(
-    guess: PowerAssumptions,
-    trials: Sequence[int],
-    wanted: float,
-    level: float,
-    family: int,
-    *,
-    at: int | None = None,
-    differences: Sequence[float] = (),
-) -> Figure:
-    """The least difference against the number of scenarios, a line for each number of trials.
-
-    Args:
-        guess: of the policies.
-        trials: of a scenario.
-        wanted: power.
-        level: confidence level.
-        family: pairs that p is adjusted for.
-        at: scenarios of the set at hand.
-        differences: that are planned for.
-    """
-    counts = np.unique(np.geomspace(10, 1000, 60).round().astype(int))
-    lines = {k: [100 * detectable(guess, int(n), k, wanted, level, family) for n in counts] for k in trials}
-
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
-            plot, axes = subplots(width.inches, 4.2 if not width.narrow else 3.6)
-            for i, (k, values) in enumerate(lines.items()):
-                label = f"{k} trial" + "s" * (k > 1)
-                axes.plot(counts, values, DASHES[i % len(DASHES)], color=colour(i), lw=2, label=label)
-            for d in differences:
-                axes.axhline(100 * d, color=LINE, lw=1)
-            if at is not None:
-                axes.axvline(at, color=SOFT, lw=1)
-                axes.annotate(f"{at}", (at, 1), (3, -10), xycoords=("data", "axes fraction"),
-                              textcoords="offset points", color=SOFT, fontsize=9)  # fmt: skip
-            axes.set_xscale("log")
-            ticks = [10, 20, 50, 100, 200, 500, 1000]
-            axes.set_xticks(ticks, [str(t) for t in ticks])
-            axes.minorticks_off()
-            axes.set(xlim=(10, 1000), ylim=(0, None), xlabel="scenarios")
-            axes.set_ylabel(f"least difference, points, at {100 * wanted:g} % power")
-            axes.legend(title="per scenario")
-            axes.grid(color=LINE, lw=0.4)
-            axes.set_axisbelow(True)
-        return plot
-
-    shown = {k: dict(zip(counts.tolist(), values, strict=True)) for k, values in lines.items()}
-    words = "; ".join(
-        f"{k} trials a scenario: "
-        + ", ".join(f"{n} scenarios {v:.0f}" for n, v in list(of.items())[::15] if not math.isnan(v))
-        for k, of in shown.items()
-    )
-    return Figure("plan", "Least difference that a set separates", f"In points. {words}.", *both(draw))

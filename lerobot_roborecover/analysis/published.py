@@ -7,7 +7,7 @@ import importlib.resources
 from dataclasses import dataclass
 from functools import cache
 
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 
 TABLES = (
     "contrasts",

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
-from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.complete_subset import Compared, compared
-from lerobot_roborecover.analysis.contrasts import Contrast, adjusted, contrasts
-from lerobot_roborecover.analysis.costs import InterventionCost, intervention_cost
-from lerobot_roborecover.analysis.estimators import DRAWS, RowsError
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate
+from lerobot_roborecover.analysis.completeness import incomplete_arms, ranked_subset
 from lerobot_roborecover.analysis.logs import Study
-from lerobot_roborecover.analysis.panel import Panel, make_panel
-from lerobot_roborecover.analysis.ranking import StartRates
-from lerobot_roborecover.analysis.resampling import SEED, Resampling, masked_mean, resample
-from lerobot_roborecover.analysis.runs import (
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.sequential_pairs import recorded_pairs, watched_pair
+from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.complete_subset import Compared, compared
+from lerobot_roborecover.analysis.stats.contrasts import Contrast, adjusted, contrasts
+from lerobot_roborecover.analysis.stats.costs import InterventionCost, intervention_cost
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.analysis.stats.ranking import StartRates
+from lerobot_roborecover.analysis.stats.resampling import Resampling, resample
+from lerobot_roborecover.analysis.stats.runs import (
     MethodContrast,
     MethodRate,
     RunRates,
@@ -27,53 +31,14 @@ from lerobot_roborecover.analysis.runs import (
     method_rate,
     run_rates,
 )
-from lerobot_roborecover.analysis.sequential_pairs import recorded_pairs, watched_pair
-from lerobot_roborecover.analysis.sequential_plan import SequentialPlan, check_plan, plan_of, recorded_plan
-from lerobot_roborecover.analysis.soundness import barred_arms
-from lerobot_roborecover.analysis.units import WORDS, ResamplingUnit, initial_unit
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
-from lerobot_roborecover.errors import check_seed
+from lerobot_roborecover.analysis.stats.soundness import barred_arms
+from lerobot_roborecover.analysis.stats.units import WORDS, ResamplingUnit, initial_unit
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.logs.sequential_record import SequentialRecord
 from lerobot_roborecover.scenario import Start
 
 MOST_PAIRS = 120
 """Pairs of policies that a figure shows, those of 16. The 7,140 of 120 policies took 209 s and 3.1 GB."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How a study is analysed."""
-
-    draws: int = DRAWS
-    seed: int = SEED
-    level: float = LEVEL
-    scheduled: int | None = None
-    """Trials every scenario was to have from each recovery point; those without a row count as failures."""
-    baseline: str | None = None
-    """Direct control that interventions are compared with; by default the same policy, or the only one."""
-    interventions: tuple[str, ...] = ()
-    """Policies to treat as interventions although none of their trials shows one."""
-    cluster: ResamplingUnit | None = None
-    """What intervals and tests take as independent; by default what the paper resamples on the platform."""
-    common: bool = False
-    """Rank all policies, on the scenarios common to all; by default those that are complete."""
-    sequential: bool = False
-    """Whether all pairs are tested so that the logs may be looked at while they grow."""
-    planned: Mapping[str, str] | None = None
-    """Units of the planned scenarios by id, for that; by default those that the rows name."""
-
-    def __post_init__(self):
-        check_seed(self.seed)
-        if self.draws < 100:
-            raise RowsError(
-                f"--draws={self.draws} bootstrap draws cannot give an interval; take at least 100"
-            )
-        if self.cluster is not None and self.cluster not in list(ResamplingUnit):
-            raise RowsError(f"--cluster={self.cluster} is not one of {', '.join(ResamplingUnit)}")
-        if not 0.5 <= self.level < 1:
-            raise RowsError(f"--level={self.level} is not a confidence level from 0.5 to 1")
-        if self.scheduled is not None and self.scheduled < 1:
-            raise RowsError(f"--trials={self.scheduled} is not a number of trials")
 
 
 @dataclass(frozen=True)
@@ -105,7 +70,7 @@ class Results:
     @cached_property
     def compared(self) -> Compared:
         """Which policies are ranked, on which scenarios."""
-        return _compared(self.recovery, self._direct, self.options)
+        return ranked_subset(self.recovery, self._direct, self.options)
 
     @cached_property
     def _direct(self) -> list[Arm]:
@@ -116,7 +81,7 @@ class Results:
     @cached_property
     def lacking(self) -> Mapping[int, str]:
         """What incomplete policies lack of what they were to be run on, by index; none has a verdict."""
-        return _lacking(self._direct, self.options)
+        return incomplete_arms(self._direct, self.options)
 
     @property
     def judged(self) -> bool:
@@ -293,7 +258,7 @@ class Results:
         draws = self.resample(panel)
         run = panel.trials > 0
         of = {arm.title: arm for arm in self.study.arms}
-        lacking = _lacking([of[title] for title in panel.arms], self.options)
+        lacking = incomplete_arms([of[title] for title in panel.arms], self.options)
         whole = [
             bool((run[a] == run[b]).all()) and not {a, b} & lacking.keys() for a, b in pairs
         ]  # fmt: skip
@@ -419,137 +384,3 @@ class Results:
     def unit(self) -> str:
         """What is taken as independent, in words."""
         return WORDS[self.recovery.unit(self.options.cluster)]
-
-
-def analyse(study: Study, options: Options | None = None) -> Results:
-    """Sorts a study's arms into direct control, initial states and interventions.
-
-    Args:
-        study: the trials.
-        options: draws, seed, and the like.
-
-    Raises:
-        RowsError: there is no direct control from recovery points, or a named policy does not exist.
-    """
-    options = options or Options()
-    for name in (*([options.baseline] if options.baseline else []), *options.interventions):
-        if name not in study.policies:
-            raise RowsError(f"no policy {name!r} in the logs; there are {', '.join(study.policies)}")
-    recovery = study.of(Start.RECOVERY)
-    acting = [arm for arm in recovery if _intervenes(arm, options) and arm.policy != options.baseline]
-    direct = _best_first([arm for arm in recovery if arm not in acting], options)
-    if not direct:
-        what = (
-            ", ".join(sorted({arm.start.value for arm in study.arms if arm not in acting}))
-            or "none but interventions"
-        )
-        raise RowsError(
-            f"no trials of direct control from recovery points (there are: {what}). Run lerobot-eval without "
-            "--env.start, or name the direct one with --baseline"
-        )
-    remarks = list(study.remarks)
-    chosen, pairs = _pair(direct, [*acting, *study.of(Start.REVERSION)], options, remarks)
-    initial = [
-        replace(arm, start=Start.RECOVERY, rewind_steps=(0,))  # titled by the policy alone
-        for arm in study.of(Start.INITIAL)
-        if arm.policy in {d.policy for d in direct}
-    ]
-    remarks += _initial_remarks(direct, initial)
-    panel = make_panel(direct, options.scheduled)
-    if words := _compared(panel, direct, options).words:
-        remarks.append(words)
-    remarks += [
-        f"{name}: its trial counts go with its outcomes (more trials where the first ones failed, or fewer), "
-        "so its rate is biased and has no verdict. Evaluate every scenario the same number of times"
-        for name, why in barred_arms(panel).items()
-        if why is ComparisonVerdict.COUNTS_DEPEND
-    ]
-    if options.common and not (panel.trials > 0).all(0).any():
-        raise RowsError("--common: no scenario was run by all policies")
-    return Results(
-        study,
-        options,
-        panel,
-        make_panel(initial).by_first_state() if initial else None,
-        make_panel(chosen, options.scheduled) if pairs else None,
-        tuple(pairs),
-        tuple(remarks),
-    )
-
-
-def _best_first(direct: Sequence[Arm], options: Options) -> list[Arm]:
-    """Policies as every table and figure shows them: highest RSR first, those that are not ranked last."""
-    if len(direct) < 2:
-        return list(direct)
-    panel = make_panel(direct, options.scheduled)
-    chosen = _compared(panel, direct, options)
-    whole = panel.rates[:, list(chosen.scenarios)] if chosen.scenarios else panel.rates
-    ranked = {p: float(whole[p].mean()) for p in chosen.policies}
-    others = masked_mean(panel.rates.T)
-
-    def place(p: int) -> tuple[bool, float, str]:
-        return p not in ranked, -ranked.get(p, others[p]), panel.arms[p]
-
-    return [direct[p] for p in sorted(range(len(direct)), key=place)]
-
-
-def _compared(panel: Panel, direct: Sequence[Arm], options: Options) -> Compared:
-    """Which policies are ranked; none whose run stopped early beside one that did not."""
-    run = panel.trials > 0
-    early = np.array([arm.unreached for arm in direct])
-    if early.any() and not early.all():
-        run = run & ~early[:, None]
-    lacking = _lacking(direct, options)
-    return compared(run, panel.arms, common=options.common and not early.any(), lacking=lacking)
-
-
-def _lacking(arms: Sequence[Arm], options: Options) -> dict[int, str]:
-    """What each incomplete arm lacks, by index. Where `--trials` says how many trials were scheduled, those
-    without a row are failures; the logs of a sequential comparison are still growing."""
-    if options.common or options.sequential:
-        return {}
-    found = {p: arm.missing for p, arm in enumerate(arms) if arm.missing}
-    if options.scheduled is not None:
-        return {p: lack.scenarios for p, lack in found.items() if lack.scenarios}
-    return {p: lack.words for p, lack in found.items()}
-
-
-def _initial_remarks(direct: Sequence[Arm], initial: Sequence[Arm]) -> list[str]:
-    if not initial:
-        return [
-            "no trials from initial states: run lerobot-eval once more with --env.start=initial to see what "
-            "recovery costs each policy"
-        ]
-    having = {arm.policy for arm in initial}
-    return [
-        f"{arm.policy}: no trials from initial states, so no rank change and no retention"
-        for arm in direct
-        if arm.policy not in having
-    ]
-
-
-def _intervenes(arm: Arm, options: Options) -> bool:
-    return arm.policy in options.interventions or any(row.interventions for row in arm.rows)
-
-
-def _pair(
-    direct: Sequence[Arm], interventions: Sequence[Arm], options: Options, remarks: list[str]
-) -> tuple[list[Arm], list[tuple[int, int]]]:
-    """Arms of the intervention panel and its (baseline, intervention) index pairs."""
-    policies = [arm.policy for arm in direct]
-    chosen: list[Arm] = []
-    pairs = []
-    for arm in interventions:
-        if arm.start is Start.REVERSION and arm.policy in policies:
-            name = arm.policy
-        else:
-            name = options.baseline or (policies[0] if len(policies) == 1 else None)
-        if name is None or name not in policies:
-            remarks.append(f"{arm.title} intervenes, but --baseline does not say what to compare it with")
-            continue
-        baseline = direct[policies.index(name)]
-        for member in (baseline, arm):
-            if member not in chosen:
-                chosen.append(member)
-        pairs.append((chosen.index(baseline), chosen.index(arm)))
-    return chosen, pairs

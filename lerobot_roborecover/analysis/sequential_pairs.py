@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.sequential import SequentialTest, grid_of, sequence, whole_units
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
-from lerobot_roborecover.analysis.units import WORDS
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.contrasts import Contrast
+from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.analysis.stats.sequential import SequentialTest, grid_of, sequence, whole_units
+from lerobot_roborecover.analysis.stats.units import WORDS
 from lerobot_roborecover.logs.sequential_record import SequentialRecord
 
 

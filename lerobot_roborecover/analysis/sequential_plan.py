@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import Study
-from lerobot_roborecover.analysis.panel import Panel
-from lerobot_roborecover.analysis.sequential import sequence
-from lerobot_roborecover.analysis.units import default_unit, unit_labels
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.contrasts import Contrast
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.analysis.stats.sequential import sequence
+from lerobot_roborecover.analysis.stats.units import default_unit, unit_labels
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING
 from lerobot_roborecover.datasets.load import load_scenarios
 from lerobot_roborecover.logs.sequential_record import (
     SequentialRecord,

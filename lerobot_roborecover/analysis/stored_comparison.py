@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
-from lerobot_roborecover.analysis.detection_page import (
+from lerobot_roborecover.analysis.detection_scores import read_scores
+from lerobot_roborecover.analysis.pages.detection import (
     NUMBERS_FILE,
     SCHEMA_VERSION,
     SCORES_FOLDER,
     MeasuredDetector,
 )
-from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
-from lerobot_roborecover.analysis.detection_scores import read_scores
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.stats.contrasts import Contrast
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial, detection_report
+from lerobot_roborecover.analysis.stats.detection_pairs import detector_contrasts
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 
 
 @dataclass(frozen=True)

@@ -8,20 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import (
+from lerobot_roborecover.analysis.stats.estimators import (
+    UNDERPOWERED_BELOW,
     RowsError,
     ScenarioRates,
     initial_rate_units,
     invalid_counts,
     scenario_rates,
 )
-from lerobot_roborecover.analysis.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
-from lerobot_roborecover.analysis.macro import MACRO_9, MacroCells, macro_cells, macro_of_scenarios
-from lerobot_roborecover.analysis.units import WORDS, default_unit
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
+from lerobot_roborecover.analysis.stats.macro import MACRO_9, MacroCells, macro_cells, macro_of_scenarios
+from lerobot_roborecover.analysis.stats.units import WORDS, default_unit
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage, Start
-
-UNDERPOWERED_BELOW = 10
-"""Scenarios of a cell below which its numbers are marked."""
 
 _TITLES = {
     Start.INITIAL: "Initial-state success",

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from lerobot_roborecover.analysis.escape import csv_text, latex, markdown
-from lerobot_roborecover.analysis.intervals import Estimate
-from lerobot_roborecover.analysis.summary import UNDERPOWERED_BELOW
+from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 
 Kind = Literal["text", "percent", "points", "ratio", "count", "number", "p"]
 Cell = str | int | float | Estimate | None

@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Prints the comparison."""
     from lerobot_roborecover.analysis.compare import compare, to_json, to_screen
-    from lerobot_roborecover.analysis.estimators import RowsError
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.sequential_plan import planned_units
+    from lerobot_roborecover.analysis.stats.estimators import RowsError
 
     if args.scenarios and not args.sequential:
         raise RowsError(

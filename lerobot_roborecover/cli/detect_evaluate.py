@@ -114,7 +114,7 @@ def refuse_with_scores(args: argparse.Namespace, names: tuple[str, ...]) -> None
 def compare(args: argparse.Namespace) -> int:
     """Compares detectors on a policy's trials."""
     from lerobot_roborecover._version import __version__
-    from lerobot_roborecover.analysis.detection_page import (
+    from lerobot_roborecover.analysis.pages.detection import (
         DETECTION_FILES,
         detection_text,
         write_detection_report,
@@ -183,7 +183,7 @@ def compare(args: argparse.Namespace) -> int:
 
 def report_scores(args: argparse.Namespace) -> int:
     """Reports a finished comparison of detectors again."""
-    from lerobot_roborecover.analysis.detection_page import (
+    from lerobot_roborecover.analysis.pages.detection import (
         DETECTION_FILES,
         detection_text,
         write_detection_report,

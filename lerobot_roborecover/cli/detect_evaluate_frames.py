@@ -52,15 +52,15 @@ def add_frame_arguments(parser: argparse._ActionsContainer, *, required: bool) -
 def run(args: argparse.Namespace) -> int:
     """Judges the frames, computes, writes and prints."""
     from lerobot_roborecover._version import __version__
-    from lerobot_roborecover.analysis.monitor_curves import choose_threshold
-    from lerobot_roborecover.analysis.monitor_page import (
+    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.analysis.pages.monitor import (
         MONITOR_FILES,
         Measured,
         summary_text,
         write_monitor_report,
     )
-    from lerobot_roborecover.analysis.monitor_report import monitor_report
-    from lerobot_roborecover.analysis.named_path import split_named
+    from lerobot_roborecover.analysis.stats.monitor_curves import choose_threshold
+    from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
     from lerobot_roborecover.detection.data.judging import judge_dataset
     from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
     from lerobot_roborecover.policies.detectors.monitor_interface import TrainedMonitor

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     pin_policy_kernels()  # outcomes of these trials are compared with those of a study
     import json
 
-    from lerobot_roborecover.analysis.labels import tell_settings_apart
+    from lerobot_roborecover.analysis.stats.labels import tell_settings_apart
     from lerobot_roborecover.curation import donors
     from lerobot_roborecover.curation.funnel import StageCounts
     from lerobot_roborecover.curation.normalisation import use_statistics_of

@@ -65,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the forks, writes the page, prints the gains."""
-    from lerobot_roborecover.analysis.fork_gain import fork_gains
-    from lerobot_roborecover.analysis.fork_page import PAGE, reproduced_text, write_gains
+    from lerobot_roborecover.analysis.pages.fork_gain import PAGE, reproduced_text, write_gains
+    from lerobot_roborecover.analysis.stats.fork_gain import fork_gains
     from lerobot_roborecover.analysis.tables import to_text
     from lerobot_roborecover.detection.forks.arms import parse_arm
     from lerobot_roborecover.detection.forks.parents import Choice

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Writes the page; offers and compares where asked. 1 when some log could not be used."""
     from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-    from lerobot_roborecover.analysis.leaderboard_page import board_table, write_leaderboard
+    from lerobot_roborecover.analysis.pages.leaderboard import board_table, write_leaderboard
     from lerobot_roborecover.analysis.tables import to_text
 
     found = make_leaderboard(args.folder, analysis_options(args), args.method)
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _write_space(args: argparse.Namespace, found: Leaderboard) -> None:
     from lerobot_roborecover.analysis.named_path import split_named
-    from lerobot_roborecover.analysis.space import SpaceConfig, write_space
+    from lerobot_roborecover.analysis.pages.space import SpaceConfig, write_space
 
     media = [(name, Path(folder)) for name, folder in map(split_named, args.videos)]
     for remark in write_space(found, args.space, SpaceConfig(args.title, args.render, media)):

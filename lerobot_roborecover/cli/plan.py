@@ -77,9 +77,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints the plan, and writes it where asked."""
-    from lerobot_roborecover.analysis.plan_tables import detectable_figure, detectable_table, plan_table
-    from lerobot_roborecover.analysis.power import plans
-    from lerobot_roborecover.analysis.style import png_of, svg_of
+    from lerobot_roborecover.analysis.figures.plan import detectable_figure
+    from lerobot_roborecover.analysis.figures.style import png_of, svg_of
+    from lerobot_roborecover.analysis.plan_tables import detectable_table, plan_table
+    from lerobot_roborecover.analysis.stats.power import plans
     from lerobot_roborecover.analysis.tables import to_csv, to_markdown, to_text
     from lerobot_roborecover.utils.atomic_io import atomic_write
     from lerobot_roborecover.utils.outputs import check_page
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    from lerobot_roborecover.analysis.estimators import RowsError
+    from lerobot_roborecover.analysis.stats.estimators import RowsError
 
     if not 5 <= args.power < 100:
         raise RowsError(f"--power={args.power:g} is not a chance from 5 to below 100 per cent")
@@ -133,11 +134,11 @@ def _check(args: argparse.Namespace) -> None:
 
 def _guess(args: argparse.Namespace):
     """What is believed, and what to know about it."""
-    from lerobot_roborecover.analysis.estimators import RowsError
     from lerobot_roborecover.analysis.logs import read_study
-    from lerobot_roborecover.analysis.panel import make_panel
-    from lerobot_roborecover.analysis.power import PowerAssumptions, guess_from
-    from lerobot_roborecover.analysis.units import ResamplingUnit
+    from lerobot_roborecover.analysis.stats.estimators import RowsError
+    from lerobot_roborecover.analysis.stats.panel import make_panel
+    from lerobot_roborecover.analysis.stats.power import PowerAssumptions, guess_from
+    from lerobot_roborecover.analysis.stats.units import ResamplingUnit
     from lerobot_roborecover.scenario import Start
 
     rate = None if args.rate is None else args.rate / 100
@@ -168,7 +169,7 @@ def _guess(args: argparse.Namespace):
 
 def _scenarios(args: argparse.Namespace) -> tuple[int, list[str]]:
     """How many there are: a number, or those of a set; and what to know about them."""
-    from lerobot_roborecover.analysis.estimators import RowsError
+    from lerobot_roborecover.analysis.stats.estimators import RowsError
 
     text = args.scenarios
     if text.lstrip("-").isdigit() and not Path(text).exists():

@@ -66,8 +66,8 @@ def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
 
 def analysis_options(args: argparse.Namespace):
     """`Options` from the arguments above and those that a command has of the rest."""
-    from lerobot_roborecover.analysis.results import Options
-    from lerobot_roborecover.analysis.units import ResamplingUnit
+    from lerobot_roborecover.analysis.options import Options
+    from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 
     return Options(
         args.draws,

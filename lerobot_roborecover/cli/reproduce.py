@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs both arms and writes the report; exit status 1 where the initial arm is below what is
     published."""
-    from lerobot_roborecover.analysis.agreement import AgreementVerdict
+    from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict
     from lerobot_roborecover.reproduce import (
         ReproductionPlan,
         find_checkpoint,

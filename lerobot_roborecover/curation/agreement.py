@@ -1,7 +1,7 @@
 """How far annotators agree before anything is resolved: raw, Fleiss' kappa and Krippendorff's alpha.
 
-Pure functions of counts. Intervals are over episodes, from `analysis.intervals`. The paper reports agreement
-rates of 92.17 % (stage) and 82.82 % (type) before majority resolution (appendix, "Annotation and
+Pure functions of counts. Intervals are over episodes, from `analysis.stats.intervals`. The paper reports
+agreement rates of 92.17 % (stage) and 82.82 % (type) before majority resolution (appendix, "Annotation and
 Recovery-Point Selection") and does not say whether a rate is over pairs of annotators or over episodes on
 which all agree; both are given here.
 
@@ -19,7 +19,13 @@ from itertools import combinations
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import Estimate, clean, rate_interval, ratio_interval, spread
+from lerobot_roborecover.analysis.stats.intervals import (
+    Estimate,
+    clean,
+    rate_interval,
+    ratio_interval,
+    spread,
+)
 from lerobot_roborecover.curation.annotation.votes import Vote
 
 NAN = Estimate(float("nan"), float("nan"), float("nan"))

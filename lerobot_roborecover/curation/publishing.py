@@ -89,7 +89,7 @@ def _rendered(root: Path, note: Callable[[str], None]) -> dict[str, np.ndarray]:
     import numpy as np
     from PIL import Image
 
-    from lerobot_roborecover.analysis.pictures import render_frames
+    from lerobot_roborecover.analysis.pages.pictures import render_frames
     from lerobot_roborecover.datasets.card import GRID_TILES
     from lerobot_roborecover.datasets.pictures import spread
     from lerobot_roborecover.datasets.read import read_scenarios

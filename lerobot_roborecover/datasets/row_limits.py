@@ -16,7 +16,8 @@ from lerobot_roborecover.datasets.schema import (
     MAX_VERSIONS,
     RESET_OPTIONS,
 )
-from lerobot_roborecover.scenario import MAX_OPTIONS_CHARS, ScenarioError
+from lerobot_roborecover.rollout import MAX_OPTIONS_CHARS
+from lerobot_roborecover.scenario import ScenarioError
 
 MAX_JSON_CONTAINERS = 2**20
 """JSON lists and objects in a file's texts, and `JSON_CONTAINERS_PER_ROW` more for every row."""

@@ -28,13 +28,8 @@ from lerobot_roborecover.datasets.trajectories import (
     actions_sha256,
 )
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.scenario import (
-    MAX_ACTION_MAGNITUDE,
-    Reset,
-    Scenario,
-    ScenarioError,
-    Task,
-)
+from lerobot_roborecover.rollout import MAX_ACTION_MAGNITUDE
+from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
 
 type Frame = Mapping[str, np.ndarray]

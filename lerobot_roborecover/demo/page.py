@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import Study, read_study
-from lerobot_roborecover.analysis.report import Extras, write_report
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.report import Extras, write_report
 from lerobot_roborecover.logs.row import TrialRow
 
 INTRODUCTION = (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from lerobot_roborecover.analysis.pictures import render_frames
+from lerobot_roborecover.analysis.pages.pictures import render_frames
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo.evaluate import eval_command, evaluate

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import ForkPair, fork_gains
+from lerobot_roborecover.analysis.stats.fork_gain import ForkPair, fork_gains
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.analysis.conformal import least_rollouts
-from lerobot_roborecover.analysis.contrasts import Contrast
-from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
-from lerobot_roborecover.analysis.detection_page import MeasuredDetector
-from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.named_path import split_named
+from lerobot_roborecover.analysis.pages.detection import MeasuredDetector
+from lerobot_roborecover.analysis.stats.conformal import least_rollouts
+from lerobot_roborecover.analysis.stats.contrasts import Contrast
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial, detection_report
+from lerobot_roborecover.analysis.stats.detection_pairs import detector_contrasts
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
 from lerobot_roborecover.detection.learning import (

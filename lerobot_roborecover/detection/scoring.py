@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_roborecover.analysis.detection import ScoredTrial
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial
 from lerobot_roborecover.detection.trials import ReplayedTrial
 from lerobot_roborecover.policies.detectors.interface import (
     Detector,

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from lerobot_roborecover.analysis.detection_figures import FilmStrip
+from lerobot_roborecover.analysis.figures.detection import FilmStrip
 from lerobot_roborecover.detection.trials import ReplayedTrial
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.stepping import follow

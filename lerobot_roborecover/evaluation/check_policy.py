@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from lerobot.configs import FeatureType, PreTrainedConfig
@@ -32,12 +31,12 @@ from lerobot_roborecover.evaluation.check_findings import (
     ok,
     warning,
 )
+from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scenario, take_steps
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
 from lerobot_roborecover.evaluation.sizes import default_slots
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
@@ -46,7 +45,7 @@ from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner, Watch
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.workers.capacity import available_gb, usable_cores
-from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
+from lerobot_roborecover.workers.messages import EpisodeStart
 
 SHORT = {"--json": "--check.json=true"}
 """What this command has and `lerobot-eval` does not, by its short name."""
@@ -69,21 +68,6 @@ class CheckPolicyConfig(RecoveryEvalConfig):
     """`roborecover eval`'s configuration, plus the check's options."""
 
     check: CheckOptions = field(default_factory=CheckOptions)
-
-
-@dataclass
-class FirstSteps:
-    """What the first steps in the simulator left."""
-
-    observations: list[dict[str, Any]]
-    """Raw, one before each step and one after the last."""
-    actions: np.ndarray
-    """(T, A), as executed."""
-    infer_s: list[float]
-    """Seconds of each inference, the first with whatever it compiles."""
-    reset_s: float
-    step_s: float
-    """Of the simulator, observation included."""
 
 
 def check(cfg: CheckPolicyConfig) -> int:
@@ -136,12 +120,12 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
         horizons = [s.task.horizon for s in scenarios]
         findings.append(names.check_horizon(config, run.pool.config.platform, min(horizons)))
         scenario = min(scenarios, key=lambda s: len(s.prefix))
-        start = _hand_off(run, scenario)
+        start = hand_off_scenario(run, scenario)
         if isinstance(start, Finding):
             return [*findings, start]
         if own is not None:
             findings += _look(cfg, own, run, scenarios, scenario, start)
-        steps = _take_steps(cfg, watched, run, scenario, start)
+        steps = take_steps(watched, run, scenario, start, seed=cfg.seed, steps=cfg.check.steps)
         if isinstance(steps, Finding):
             return [*findings, steps]
         findings.append(numbers.check_executed(steps.actions, run.pool.config.platform))
@@ -180,83 +164,6 @@ def _not_loaded(err: Exception) -> Finding:
     text = f"{type(err).__name__}: {err}".splitlines()[0]
     remedy = load_remedy(err) or "see the message; 'roborecover doctor' checks what is installed"
     return failure("loads", text, "a policy with its processors", remedy)
-
-
-def _hand_off(run: EvalSession, scenario: Scenario) -> EpisodeStart | Finding:
-    slot = run.pool.slots(1)[0]
-    protocol = run.protocol
-    spec = EpisodeSpec(scenario, protocol.start, protocol.rewind_for(scenario), run.handoff_check)
-    slot.send("reset", spec)
-    reply = slot.receive()
-    if isinstance(reply, SlotFailure):
-        return failure(
-            "simulator", reply.message, f"scenario {scenario.id} handed off",
-            "'roborecover doctor' checks simulators and OpenGL",
-        )  # fmt: skip
-    assert isinstance(reply, EpisodeStart)
-    if reply.handoff.problem is not None:
-        return failure(
-            "simulator", f"{reply.handoff.problem.value}: {reply.handoff.reason}",
-            f"scenario {scenario.id} handed off within 2 mm",
-            "the installed versions or assets differ from those the scenarios were recorded with",
-        )  # fmt: skip
-    return reply
-
-
-def _take_steps(
-    cfg: CheckPolicyConfig, host: PolicyRunner, run: EvalSession, scenario: Scenario, start: EpisodeStart
-) -> FirstSteps | Finding:
-    """A few steps, one action at a time, so that every observation is seen."""
-    slot = run.pool.slots(1)[0]
-    observations, actions, infer_s, step_s = [start.observation], [], [], []
-    width = run.action_width(scenario)
-    history = host.start(cfg.seed)
-    try:
-        while len(actions) < cfg.check.steps:
-            began = time.perf_counter()
-            (chunk,) = host.act([observations[-1]], [scenario.task.instruction], [history])
-            infer_s.append(time.perf_counter() - began)
-            if isinstance(chunk, PolicyError):
-                return failure(
-                    "actions", str(chunk), "a chunk of actions",
-                    "the policy cannot take what the env gives: see the inputs above, and the message",
-                )  # fmt: skip
-            if problem := chunk_problem(scenario, chunk, width):
-                return _refused(problem, width)
-            for action in chunk[: cfg.check.steps - len(actions)]:
-                if problem := action_problem(scenario, action, width):
-                    return _refused(problem, width)
-                slot.send("act", action[None])
-                reply = slot.receive()
-                if isinstance(reply, SlotFailure):
-                    return failure(
-                        "simulator", reply.message, "a step", "'roborecover doctor' checks simulators"
-                    )
-                assert isinstance(reply, ActResult)
-                actions.append(np.asarray(action, dtype=np.float64))
-                step_s.append(reply.seconds)
-                if reply.observation is None:  # the trial is over
-                    break
-                observations.append(reply.observation)
-            else:
-                continue
-            break
-        if len(infer_s) == 1 and len(observations) > 1:  # the first one alone tells little about speed
-            began = time.perf_counter()
-            host.act([observations[-1]], [scenario.task.instruction], [history])
-            infer_s.append(time.perf_counter() - began)
-    finally:
-        host.finish(history)
-    step = statistics.median(step_s)
-    return FirstSteps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
-
-
-def _refused(problem: str, width: int) -> Finding:
-    return failure(
-        "actions", problem, f"{width} finite values",
-        "such an action is never sent to the simulator; every trial would be a policy_error. Check the "
-        "checkpoint's statistics and that it is for this robot",
-    )  # fmt: skip
 
 
 def _look(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import rate_interval, spread
+from lerobot_roborecover.analysis.stats.intervals import rate_interval, spread
 from lerobot_roborecover.evaluation.session import group_name
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import RowLog

@@ -11,9 +11,9 @@ from typing import Any, Protocol, TextIO
 
 import numpy as np
 
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.analysis.stats.units import default_unit, initial_unit, unit_labels
 from lerobot_roborecover.analysis.summary import rate_estimate
-from lerobot_roborecover.analysis.units import default_unit, initial_unit, unit_labels
 from lerobot_roborecover.scenario import Start
 
 _LINE_EVERY_S = 15.0

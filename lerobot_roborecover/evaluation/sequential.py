@@ -1,7 +1,7 @@
 """`roborecover eval --sequential`: a run that may be looked at, and that stops when its comparison is
 decided.
 
-1. Scenarios are run in `analysis.sequential`'s order, all trials of one before the next one's.
+1. Scenarios are run in `analysis.stats.sequential`'s order, all trials of one before the next one's.
 2. A scenario counts when all its trials and those of all scenarios before it are in. Whatever ends early
    counts no earlier for it, and what slots have run ahead does not count at all.
 3. The line shows the rate and, against another policy's log, the difference with their confidence sequences.
@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.analysis.intervals import LEVEL
-from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
-from lerobot_roborecover.analysis.units import default_unit, initial_unit, unit_labels
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING
+from lerobot_roborecover.analysis.stats.intervals import LEVEL
+from lerobot_roborecover.analysis.stats.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.stats.units import default_unit, initial_unit, unit_labels
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.progress import RunProgress
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 from typing import Protocol as Interface
 
@@ -30,6 +29,7 @@ import numpy as np
 
 from lerobot_roborecover.evaluation.intervention_record import InterventionRecord
 from lerobot_roborecover.evaluation.real_time import LatencyModel, RealTime
+from lerobot_roborecover.evaluation.trial_state import FAILURES, IN_SIMULATOR, TrialState
 from lerobot_roborecover.logs.actions import actions_digest
 from lerobot_roborecover.logs.row import (
     EvalProtocol,
@@ -54,36 +54,6 @@ from lerobot_roborecover.workers.messages import (
 )
 
 SOLVED_THERE = "the task's predicate already holds where the rollback went"
-FAILURES = {
-    "raised": Outcome.SIM_ERROR,
-    "died": Outcome.SIM_ERROR,
-    "hung": Outcome.TIMEOUT,
-    "lost": Outcome.SIM_ERROR,
-}
-"""Outcome of a trial by the kind of its slot's failure; a `lost` trial is first run again elsewhere."""
-
-
-class TrialState(StrEnum):
-    """State of a trial."""
-
-    NEW = "new"
-    """No request has been sent yet."""
-    HANDING_OFF = "handing_off"
-    """A simulator rebuilds its start."""
-    WAITING = "waiting"
-    """It has an observation that the policy has not received yet."""
-    ASKED = "asked"
-    """The policy infers."""
-    ACTING = "acting"
-    """A simulator executes actions."""
-    GOING_BACK = "going_back"
-    """A simulator is put back to an earlier state."""
-    OVER = "over"
-    """It has an outcome, or was skipped."""
-
-
-IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK)
-"""States that a simulator's reply ends."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 from unicodedata import normalize
 
-from lerobot_roborecover.logs.schema import MAX_TEXT, TRIAL_SCHEMA
+from lerobot_roborecover.logs.fields import MAX_TEXT, TRIAL_SCHEMA
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart

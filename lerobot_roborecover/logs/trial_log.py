@@ -21,9 +21,10 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
+from lerobot_roborecover.logs.fields import MAX_LINE_BYTES, FieldProblem
 from lerobot_roborecover.logs.log_file import LogFileError, LogTextError, appendable, open_log
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow, row_of
-from lerobot_roborecover.logs.schema import MAX_LINE_BYTES, FieldProblem, RowChecker, parse_json
+from lerobot_roborecover.logs.schema import RowChecker, parse_json
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.utils.journal import AppendOnly, InUseError, append_records, complete_lines
 

@@ -7,22 +7,19 @@ of other distributions are found through the entry-point group `roborecover.plat
 from __future__ import annotations
 
 import importlib
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.names import nearest
-from lerobot_roborecover.platforms.simulator import Observation, Simulator, SimulatorError
+from lerobot_roborecover.platforms.catalog import TaskCatalog
+from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task, TrialStart
 
 if TYPE_CHECKING:
-    from lerobot.envs.configs import EnvConfig
-
     from lerobot_roborecover.platforms.controls import Controls
     from lerobot_roborecover.platforms.findings import Check
     from lerobot_roborecover.platforms.starts import Starts
@@ -72,7 +69,7 @@ class VideoEnvMixin:
     """Render frames for LeRobot's videos also where the observation has no pixels (`RecoveryOptions`)."""
 
 
-class Platform:
+class Platform(TaskCatalog):
     """One simulator family. Subclass it, set the attributes, and override what the defaults do not fit.
 
     Nothing here imports a simulator, LeRobot or torch before it is asked for: the list of platforms is read
@@ -151,78 +148,6 @@ class Platform:
             width: values in an action.
         """
         return tuple(i for i, n in enumerate(self.action_names.get(width, ())) if n.endswith("gripper"))
-
-    # --- tasks
-
-    def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
-        """Every task, in the catalogue's order.
-
-        Args:
-            options: of the simulator, where the catalogue depends on them.
-
-        Raises:
-            SimulatorError: what the catalogue is read from is not installed.
-        """
-        raise NotImplementedError
-
-    def task(self, name: str, instruction: str = "", suite: str = "") -> Task:
-        """A task by its name.
-
-        Args:
-            name: the platform's own task name.
-            instruction: as recorded; by default the platform's own.
-            suite: needed only where several have a task of this name.
-
-        Raises:
-            ScenarioError: there is no such task, or there are several.
-        """
-        found = [t for t in self.tasks() if t.name == name and suite in ("", t.suite)]
-        if not found:
-            there = {t.name for t in self.tasks() if suite in ("", t.suite)}
-            of = f" in suite {suite!r:.80}" if suite else ""
-            raise ScenarioError(f"{self.name} has no task {name!r:.120}{of}{nearest(name, there)}")
-        if len(found) > 1:
-            suites = ", ".join(t.suite for t in found)
-            raise ScenarioError(
-                f"{len(found)} suites of {self.name} have a task {name!r:.120} ({suites}): name the suite"
-            )
-        said = instruction or found[0].instruction
-        return Task(self.name, found[0].suite, found[0].name, said, found[0].horizon)
-
-    def task_by_instruction(self, instruction: str, suite: str = "") -> Task:
-        """A task by its instruction, letter case and spaces aside.
-
-        Raises:
-            ScenarioError: no task has it, or several have.
-        """
-        wanted = _plain(instruction)
-        found = [t for t in self.tasks() if _plain(t.instruction) == wanted and suite in ("", t.suite)]
-        if len(found) != 1:
-            raise ScenarioError(
-                f"{len(found)} tasks of {self.name} have the instruction {instruction!r:.120}"
-                + (f": {', '.join(f'{t.suite}/{t.name}' for t in found)}" if found else "")
-                + "; name the task (--task NAME) or the suite (--suite)"
-            )
-        return self.task(found[0].name, instruction, found[0].suite)
-
-    def check_task(self, task: Task) -> None:
-        """Refuses a task that the platform does not have.
-
-        Raises:
-            ScenarioError: unknown suite or task; names the nearest ones.
-            SimulatorError: what the catalogue is read from is not installed.
-        """
-        suites: dict[str, set[str]] = defaultdict(set)
-        for known in self.tasks():
-            suites[known.suite].add(known.name)
-        if task.suite not in suites:
-            raise ScenarioError(f"{self.name} has no suite {task.suite!r}; there are {', '.join(suites)}")
-        if task.name not in suites[task.suite]:
-            elsewhere = [s for s, names in suites.items() if task.name in names]
-            hint = (
-                f"; it is a task of {elsewhere[0]}" if elsewhere else nearest(task.name, suites[task.suite])
-            )
-            raise ScenarioError(f"{self.name} suite {task.suite} has no task {task.name!r}{hint}")
 
     def check_scenario(self, scenario: TrialStart) -> None:
         """Refuses a scenario whose actions the platform cannot execute.
@@ -424,53 +349,3 @@ class Platform:
 
     def __repr__(self) -> str:
         return f"<platform {self.name}>"
-
-
-def refuse_unused(config: EnvConfig, base: type[EnvConfig], names: tuple[str, ...]) -> None:
-    """Refuses options that LeRobot's own env has and a scenario settles by itself.
-
-    Args:
-        config: what was parsed.
-        base: LeRobot's own dataclass.
-        names: of its options.
-
-    Raises:
-        OptionError: one of them was given.
-    """
-    defaults = {f.name: f.default for f in fields(base)}
-    for name in names:
-        if getattr(config, name) != defaults[name]:
-            raise OptionError(
-                f"--env.{name}={getattr(config, name)}: the scenario decides this. "
-                "Choose scenarios with --env.select"
-            )
-
-
-def check_quality(quality: str) -> None:
-    """Refuses a `render_quality` that MuJoCo platforms do not have.
-
-    Raises:
-        OptionError: naming those that there are.
-    """
-    if quality not in ("full", "fast"):
-        raise OptionError(f"--env.render_quality={quality}: not one of full, fast")
-
-
-def chosen_quality(quality: str) -> dict[str, str]:
-    """Left out where it is LeRobot's: trials from before there was a choice keep their identity."""
-    return {} if quality == "full" else {"render_quality": quality}
-
-
-def no_video(_: Observation) -> np.ndarray:
-    """Placeholder frame where no video is requested: grey, so that it is not mistaken for a dark scene."""
-    return np.full((64, 64, 3), 128, np.uint8)
-
-
-def first_camera(observation: Observation) -> np.ndarray:
-    """The picture of an observation, or of its first camera."""
-    pixels = observation["pixels"]
-    return next(iter(pixels.values())) if isinstance(pixels, Mapping) else pixels
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.lower().split())

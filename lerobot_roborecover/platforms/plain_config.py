@@ -11,7 +11,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin, first_camera, no_video
+from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
+from lerobot_roborecover.platforms.env_options import first_camera, no_video
 
 OBS_TYPES = ("state", "pixels_agent_pos")
 

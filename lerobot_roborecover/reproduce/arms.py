@@ -13,9 +13,9 @@ from typing import Any
 
 import yaml
 
-from lerobot_roborecover.analysis.agreement import AgreementVerdict, ScoreAgreement, agreement
 from lerobot_roborecover.analysis.first_states import with_first_states
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict, ScoreAgreement, agreement
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover._version import __version__
-from lerobot_roborecover.analysis.agreement import AgreementVerdict, ScoreAgreement
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict, ScoreAgreement
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.tables import Cell, Column, Table, to_markdown
 from lerobot_roborecover.reproduce.arms import (
     INITIAL,

@@ -12,9 +12,9 @@ from typing import Any
 
 import yaml
 
-from lerobot_roborecover.analysis.agreement import mixed_rate
-from lerobot_roborecover.analysis.intervals import Estimate
 from lerobot_roborecover.analysis.published import policies
+from lerobot_roborecover.analysis.stats.agreement import mixed_rate
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import Scenario
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis.make import Gallery, Report, report
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
 from lerobot_roborecover.evaluation.sizes import SLOT_GB

@@ -81,10 +81,11 @@ def summary_tables(study: StudyDefinition, done: Sequence[StudyArm]) -> str:
         study: what.
         done: arms with logs.
     """
+    from lerobot_roborecover.analysis.analyse import analyse
     from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions
     from lerobot_roborecover.analysis.logs import read_study
+    from lerobot_roborecover.analysis.options import Options
     from lerobot_roborecover.analysis.report_tables import interventions
-    from lerobot_roborecover.analysis.results import Options, analyse
     from lerobot_roborecover.analysis.tables import to_markdown
 
     options = Options(baseline=study.base, interventions=study.interventions)
@@ -98,7 +99,7 @@ def summary_tables(study: StudyDefinition, done: Sequence[StudyArm]) -> str:
 
 
 def _policies(results: Results) -> Table:
-    from lerobot_roborecover.analysis.report_tables import overall
+    from lerobot_roborecover.analysis.policy_tables import overall
     from lerobot_roborecover.analysis.tables import Cell, Table
 
     whole = overall(results)

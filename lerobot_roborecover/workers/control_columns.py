@@ -22,7 +22,7 @@ from enum import IntEnum
 import numpy as np
 
 SIGNATURE = 21074.0
-"""Exact in float32, and beyond any action (`scenario.MAX_ACTION_MAGNITUDE`)."""
+"""Exact in float32, and beyond any action (`rollout.MAX_ACTION_MAGNITUDE`)."""
 WIDTH = 5
 BY_RULE = -1
 """Rollback by `Platform.rewind_steps`."""

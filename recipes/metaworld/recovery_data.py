@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.style import LINE, colour, dash, drawing, marker, svg_of
+from lerobot_roborecover.analysis.figures.style import LINE, colour, dash, drawing, marker, svg_of
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.utils.atomic_io import atomic_dir
 from recipes.commands import evaluate, roborecover

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.estimators import (
+from lerobot_roborecover.analysis.stats.estimators import (
     RowsError,
     invalid_counts,
     macro,

@@ -12,20 +12,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_roborecover.analysis.arms import Arm
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare
-from lerobot_roborecover.analysis.contrasts import holm
-from lerobot_roborecover.analysis.crossfit import gain_over, oracle, profile_difference
-from lerobot_roborecover.analysis.intervals import difference_interval, rate_interval, spread
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.panel import make_panel
-from lerobot_roborecover.analysis.permutation import sign_flip_p
-from lerobot_roborecover.analysis.report_tables import overall
-from lerobot_roborecover.analysis.resampling import resample
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.policy_tables import overall
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.contrasts import holm
+from lerobot_roborecover.analysis.stats.crossfit import gain_over, oracle, profile_difference
+from lerobot_roborecover.analysis.stats.intervals import difference_interval, rate_interval, spread
+from lerobot_roborecover.analysis.stats.panel import make_panel
+from lerobot_roborecover.analysis.stats.permutation import sign_flip_p
+from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 from lerobot_roborecover.analysis.summary import summarise
-from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.evaluation.progress import RunProgress
 from lerobot_roborecover.scenario import Start

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
 
-from lerobot_roborecover.analysis.calibration import as_probability, calibration, platt
-from lerobot_roborecover.analysis.conformal import conformal_threshold, halves, least_rollouts
-from lerobot_roborecover.analysis.detection import (
+from lerobot_roborecover.analysis.stats.calibration import as_probability, calibration, platt
+from lerobot_roborecover.analysis.stats.conformal import conformal_threshold, halves, least_rollouts
+from lerobot_roborecover.analysis.stats.detection import (
     DEVIATED,
     NEEDS_HELP,
     ScoredTrial,
@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.detection import (
     detection_report,
     frames_of,
 )
-from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
+from lerobot_roborecover.analysis.stats.detection_pairs import detector_contrasts
 
 
 def trial(number: int, scores, *, start="recovery", success=False, handoff=0, decisions=None) -> ScoredTrial:

@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from lerobot_roborecover.analysis.arms import Arm
-from lerobot_roborecover.analysis.contrasts import contrasts, contributions
-from lerobot_roborecover.analysis.costs import intervention_cost
-from lerobot_roborecover.analysis.crossfit import oracle, profile_difference
-from lerobot_roborecover.analysis.estimators import RowsError, macro, rsr, scenario_rates
-from lerobot_roborecover.analysis.groups import group_rates, own_arm, source_matrix
-from lerobot_roborecover.analysis.macro import macro_estimates, percentile_macro
-from lerobot_roborecover.analysis.monitor import METRICS, metric_columns
-from lerobot_roborecover.analysis.panel import make_panel
-from lerobot_roborecover.analysis.ranking import StartRates, rank_agreement
-from lerobot_roborecover.analysis.resampling import masked_mean, resample
-from lerobot_roborecover.analysis.timing import budget_estimates, median_steps, rates_within
-from lerobot_roborecover.analysis.variance import variance_split
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.contrasts import contrasts, contributions
+from lerobot_roborecover.analysis.stats.costs import intervention_cost
+from lerobot_roborecover.analysis.stats.crossfit import oracle, profile_difference
+from lerobot_roborecover.analysis.stats.estimators import RowsError, macro, rsr, scenario_rates
+from lerobot_roborecover.analysis.stats.groups import group_rates, own_arm, source_matrix
+from lerobot_roborecover.analysis.stats.macro import macro_estimates, percentile_macro
+from lerobot_roborecover.analysis.stats.monitor import METRICS, metric_columns
+from lerobot_roborecover.analysis.stats.panel import make_panel
+from lerobot_roborecover.analysis.stats.ranking import StartRates, rank_agreement
+from lerobot_roborecover.analysis.stats.resampling import masked_mean, resample
+from lerobot_roborecover.analysis.stats.timing import budget_estimates, median_steps, rates_within
+from lerobot_roborecover.analysis.stats.variance import variance_split
 from lerobot_roborecover.logs.trial_log import TrialLogError
 from lerobot_roborecover.scenario import Start
 from tests.support.bootstrap import bootstrap_interval

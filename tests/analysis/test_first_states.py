@@ -8,18 +8,19 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare
-from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
 from lerobot_roborecover.analysis.gain_tables import inversions
-from lerobot_roborecover.analysis.gains import gains_by_group, groups_by_driver
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.ranking import pairs_from_both_starts
-from lerobot_roborecover.analysis.report_tables import initial_estimates, overall
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.soundness import barred_arms
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.policy_tables import initial_estimates, overall
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial, detection_report
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts
+from lerobot_roborecover.analysis.stats.soundness import barred_arms
+from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 from lerobot_roborecover.analysis.summary import format_table, summarise
-from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.evaluation.progress import RunProgress

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.fork_gain import ForkNote, fork_gains, gain_tables
-from lerobot_roborecover.analysis.fork_page import write_gains
-from lerobot_roborecover.analysis.intervals import difference_interval, spread
+from lerobot_roborecover.analysis.fork_tables import gain_tables
 from lerobot_roborecover.analysis.logs import RowsError, read_study
-from lerobot_roborecover.analysis.units import ResamplingUnit
+from lerobot_roborecover.analysis.pages.fork_gain import write_gains
+from lerobot_roborecover.analysis.stats.fork_gain import ForkNote, fork_gains
+from lerobot_roborecover.analysis.stats.intervals import difference_interval, spread
+from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.trial_rows import trial_row, write_log
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 
-from lerobot_roborecover.analysis import glyphs
-from lerobot_roborecover.analysis.figures import all_figures
-from lerobot_roborecover.analysis.glyphs import drawable, families
+from lerobot_roborecover.analysis.analyse import analyse
+from lerobot_roborecover.analysis.figures import glyphs
+from lerobot_roborecover.analysis.figures.glyphs import drawable, families
+from lerobot_roborecover.analysis.figures.rates import all_figures
+from lerobot_roborecover.analysis.figures.style import drawing, png_of, svg_of
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.style import drawing, png_of, svg_of
+from lerobot_roborecover.analysis.options import Options
 from tests.support.trial_rows import policy_rows, write_log
 
 

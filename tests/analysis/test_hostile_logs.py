@@ -12,16 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.analysis.escape import csv_text, latex, markdown, markdown_alt
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.logs.fields import FIELD_CHECKS, FieldProblem
 from lerobot_roborecover.logs.merge import merge
 from lerobot_roborecover.logs.row import TrialRow, make_row
-from lerobot_roborecover.logs.schema import _CHECKS, FieldProblem, RowChecker, parse_json
+from lerobot_roborecover.logs.schema import RowChecker, parse_json
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_log, read_trial_log
 from tests.support.trial_rows import trial_row, write_log
 
@@ -39,7 +40,7 @@ def line_of(**changes) -> str:
 
 
 def test_every_field_has_its_check():
-    assert list(_CHECKS) == NAMES
+    assert list(FIELD_CHECKS) == NAMES
 
 
 @pytest.mark.slow

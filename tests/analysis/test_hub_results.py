@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.hub_board import HubResult, comparison_table
 from lerobot_roborecover.analysis.hub_results import file_name, find_entry, results_yaml
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.cli.main import main
 from tests.support.hub_client import HubClient
 from tests.support.hub_server import Repo

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare, to_screen
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.hub_results import find_entry, results_yaml
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.report_tables import overall
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.policy_tables import overall
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.logs.extent import missing
 from lerobot_roborecover.logs.merge import merge

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.latency import latency_figure, latency_rates, latency_table
+from lerobot_roborecover.analysis.figures.latency import latency_figure
+from lerobot_roborecover.analysis.latency import latency_rates, latency_table
 from lerobot_roborecover.analysis.logs import clock_of, read_study
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.tables import to_text
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 

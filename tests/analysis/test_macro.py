@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.analysis import published
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.leaderboard_page import board_table
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.macro import LEAST_IN_CELL, PAPER_CELLS, macro_cells
-from lerobot_roborecover.analysis.report_tables import beside_published, overall
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.leaderboard import board_table
+from lerobot_roborecover.analysis.policy_tables import beside_published, overall
+from lerobot_roborecover.analysis.stats.macro import LEAST_IN_CELL, PAPER_CELLS, macro_cells
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.scenario import Start
 from tests.support.trial_rows import trial_row, write_log

@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.intervals import jackknife, rate_interval
-from lerobot_roborecover.analysis.monitor import METRICS, MonitorFrames, metric_columns
-from lerobot_roborecover.analysis.monitor_curves import choose_threshold
-from lerobot_roborecover.analysis.monitor_page import Measured, summary_text, to_json, write_monitor_report
-from lerobot_roborecover.analysis.monitor_report import monitor_report
+from lerobot_roborecover.analysis.pages.monitor import Measured, summary_text, to_json, write_monitor_report
 from lerobot_roborecover.analysis.published import table as published_table
+from lerobot_roborecover.analysis.stats.intervals import jackknife, rate_interval
+from lerobot_roborecover.analysis.stats.monitor import METRICS, MonitorFrames, metric_columns
+from lerobot_roborecover.analysis.stats.monitor_curves import choose_threshold
+from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
 
 
 def frames(rows, threshold=0.5) -> MonitorFrames:

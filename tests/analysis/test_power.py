@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.panel import make_panel
-from lerobot_roborecover.analysis.power import (
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.panel import make_panel
+from lerobot_roborecover.analysis.stats.power import (
     PowerAssumptions,
     detectable,
     guess_from,

@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from lerobot_roborecover.analysis import published
-from lerobot_roborecover.analysis.estimators import macro, rsr
-from lerobot_roborecover.analysis.monitor import METRICS, metric_columns
-from lerobot_roborecover.analysis.ranking import inverted_pairs
+from lerobot_roborecover.analysis.stats.estimators import macro, rsr
+from lerobot_roborecover.analysis.stats.monitor import METRICS, metric_columns
+from lerobot_roborecover.analysis.stats.ranking import inverted_pairs
 
 POLICIES = [(p.platform, p.policy) for p in published.policies()]
 

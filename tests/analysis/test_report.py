@@ -14,13 +14,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.gallery import make_cards
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.make import report
-from lerobot_roborecover.analysis.report import headline, write_report
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.gallery import make_cards
+from lerobot_roborecover.analysis.pages.report import headline, write_report
 from lerobot_roborecover.analysis.report_tables import all_tables
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.summary import Estimate
 from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown
 from lerobot_roborecover.cli.main import main

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.gallery import TrialVideo
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.report import Extras, write_report
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.gallery import TrialVideo
+from lerobot_roborecover.analysis.pages.report import Extras, write_report
 from tests.support.browser import open_page
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 

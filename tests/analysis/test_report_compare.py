@@ -10,9 +10,9 @@ from dataclasses import replace
 import pytest
 
 from lerobot_roborecover.analysis.compare import compare, to_json, to_screen
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.logs.merge import merge
 from lerobot_roborecover.logs.trial_log import TrialLogError

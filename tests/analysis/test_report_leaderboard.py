@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.leaderboard import as_json, make_leaderboard, ranks
-from lerobot_roborecover.analysis.leaderboard_page import board_table, write_leaderboard
-from lerobot_roborecover.analysis.results import Options
+from lerobot_roborecover.analysis.board import ranks
+from lerobot_roborecover.analysis.leaderboard import as_json, make_leaderboard
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.leaderboard import board_table, write_leaderboard
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.cli.main import main
 from tests.support.browser import open_page
 from tests.support.trial_rows import policy_rows, trial_row, write_log

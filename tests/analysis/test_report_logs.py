@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.results import Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.logs.trial_log import TrialLogError
 from tests.support.trial_rows import trial_row, write_log
 

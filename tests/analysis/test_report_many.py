@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from lerobot_roborecover.analysis import report_tables
-from lerobot_roborecover.analysis.figures import paired_differences
+from lerobot_roborecover.analysis import pair_tables
+from lerobot_roborecover.analysis.analyse import analyse
+from lerobot_roborecover.analysis.figures.rates import paired_differences
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.results import MOST_PAIRS, Options, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.results import MOST_PAIRS
 from tests.support.trial_rows import policy_rows, write_log
 
 
@@ -23,11 +25,11 @@ def results_of(folder, policies):
 def test_pairs_that_are_drawn_and_dealt_are_bounded(tmp_path, monkeypatch, policies, shown):
     """120 policies are 7,140 pairs: a figure of as many rows took 209 s and 3.1 GB."""
     results = results_of(tmp_path, policies)
-    calls, own = [], report_tables.profile_difference
+    calls, own = [], pair_tables.profile_difference
     monkeypatch.setattr(
-        report_tables, "profile_difference", lambda *args: calls.append(args[1:3]) or own(*args)
+        pair_tables, "profile_difference", lambda *args: calls.append(args[1:3]) or own(*args)
     )
-    profiles, contrasts = report_tables.profiles(results), report_tables.paired_contrasts(results)
+    profiles, contrasts = pair_tables.profiles(results), pair_tables.paired_contrasts(results)
     pairs = policies * (policies - 1) // 2
     assert len(calls) == len(profiles.rows) == shown <= MOST_PAIRS
     assert len(contrasts.rows) == pairs, "every pair has its numbers"

@@ -9,24 +9,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare, to_screen
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.headline import headline
-from lerobot_roborecover.analysis.intervals import difference_interval, difference_p, rate_interval, spread
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.leaderboard_page import board_table
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.named_path import split_runs
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.leaderboard import board_table
 from lerobot_roborecover.analysis.report_tables import all_tables
-from lerobot_roborecover.analysis.resampling import resample
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.runs import (
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.intervals import (
+    difference_interval,
+    difference_p,
+    rate_interval,
+    spread,
+)
+from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.runs import (
     RunRates,
     crossed_difference,
     crossed_spread,
     hierarchical_bootstrap,
 )
-from lerobot_roborecover.analysis.verdicts import LEAST_RUNS, ComparisonVerdict
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_RUNS, ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 

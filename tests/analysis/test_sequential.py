@@ -15,16 +15,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.analysis.arms import Arm
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare, to_screen
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import Study, read_study
-from lerobot_roborecover.analysis.panel import make_panel
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.sequential_pairs import watched_pair
 from lerobot_roborecover.analysis.sequential_plan import SequentialPlan
-from lerobot_roborecover.analysis.verdicts import LEAST_DIFFERING, ComparisonVerdict
+from lerobot_roborecover.analysis.stats.arms import Arm
+from lerobot_roborecover.analysis.stats.panel import make_panel
+from lerobot_roborecover.analysis.stats.sequential import RateSequence, SequentialTest, grid_of, sequence
+from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.errors import OptionError
@@ -96,7 +97,7 @@ def test_what_comes_after_the_decision_counts_no_more():
 
 def test_looking_every_time_with_a_fixed_test_would_be_wrong():
     """What the sequential test is for: a fixed-n test at every look errs far more often than it says."""
-    from lerobot_roborecover.analysis.permutation import sign_flip_p
+    from lerobot_roborecover.analysis.stats.permutation import sign_flip_p
 
     rng = np.random.default_rng(0)
     walks = rng.integers(0, 2, (150, 40)) * 2 - 1

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.compare import compare
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.leaderboard_page import board_table
 from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.leaderboard import board_table
 from lerobot_roborecover.analysis.report_tables import all_tables
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.soundness import counts_depend_on_outcomes
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.stats.soundness import counts_depend_on_outcomes
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
 QUICK = Options(draws=200)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.leaderboard import make_leaderboard
-from lerobot_roborecover.analysis.media import find_media
-from lerobot_roborecover.analysis.results import Options
-from lerobot_roborecover.analysis.space import SpaceConfig, write_space
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.media import find_media
+from lerobot_roborecover.analysis.pages.space import SpaceConfig, write_space
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.datasets import load_scenarios
 from tests.support.browser import open_page
 from tests.support.trial_rows import policy_rows, trial_row, write_log

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.detection import ScoredTrial, detection_report
-from lerobot_roborecover.analysis.detection_page import MeasuredDetector, write_detection_report
-from lerobot_roborecover.analysis.detection_pairs import detector_contrasts
 from lerobot_roborecover.analysis.detection_scores import MAX_SCORES, read_scores
-from lerobot_roborecover.analysis.estimators import RowsError
+from lerobot_roborecover.analysis.pages.detection import MeasuredDetector, write_detection_report
+from lerobot_roborecover.analysis.stats.detection import ScoredTrial, detection_report
+from lerobot_roborecover.analysis.stats.detection_pairs import detector_contrasts
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.cli.main import main
 

@@ -8,16 +8,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.results import analyse
+from lerobot_roborecover.analysis.report_tables import trial_metrics
+from lerobot_roborecover.analysis.stats.trial_metrics import METRICS, metric_estimates, scenario_means
 from lerobot_roborecover.analysis.summary import format_table, summarise
-from lerobot_roborecover.analysis.trial_metrics import (
-    METRICS,
-    metric_estimates,
-    scenario_means,
-    trial_metrics,
-)
 from lerobot_roborecover.scenario import Outcome, Start
 from tests.support.trial_rows import three_policies, trial_row, write_log
 

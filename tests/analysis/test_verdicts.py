@@ -11,19 +11,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lerobot_roborecover.analysis.analyse import analyse
+from lerobot_roborecover.analysis.board import ranks, separated
 from lerobot_roborecover.analysis.compare import compare, to_screen
-from lerobot_roborecover.analysis.complete_subset import compared
-from lerobot_roborecover.analysis.estimators import RowsError
-from lerobot_roborecover.analysis.figures import forest, paired_differences
-from lerobot_roborecover.analysis.figures_trials import oracle_bars
+from lerobot_roborecover.analysis.figures.rates import forest, paired_differences
+from lerobot_roborecover.analysis.figures.trials import oracle_bars
 from lerobot_roborecover.analysis.headline import headline
-from lerobot_roborecover.analysis.leaderboard import make_leaderboard, ranks, separated
-from lerobot_roborecover.analysis.leaderboard_page import board_table
+from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.permutation import _random_flips, sign_flip_p
-from lerobot_roborecover.analysis.report_tables import interventions, oracle_table, overall, paired_contrasts
-from lerobot_roborecover.analysis.results import Options, analyse
-from lerobot_roborecover.analysis.verdicts import ComparisonVerdict
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.pages.leaderboard import board_table
+from lerobot_roborecover.analysis.pair_tables import paired_contrasts
+from lerobot_roborecover.analysis.policy_tables import overall
+from lerobot_roborecover.analysis.report_tables import interventions, oracle_table
+from lerobot_roborecover.analysis.stats.complete_subset import compared
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.permutation import _random_flips, sign_flip_p
+from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.cli.main import main
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 

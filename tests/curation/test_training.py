@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.fork_gain import ForkNote
+from lerobot_roborecover.analysis.stats.fork_gain import ForkNote
 from lerobot_roborecover.curation.training.export import (
     ADVANTAGE,
     DONE,

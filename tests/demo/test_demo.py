@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis import pictures
+from lerobot_roborecover.analysis.pages import pictures
 from lerobot_roborecover.cli import main as cli
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.demo import DemoError

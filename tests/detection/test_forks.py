@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.analysis.fork_gain import CONTINUE, MATCHED, fork_gains, note_of
+from lerobot_roborecover.analysis.stats.fork_gain import CONTINUE, MATCHED, fork_gains, note_of
 from lerobot_roborecover.detection.forks.arms import ForkArm, parse_arm
 from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, usable
 from lerobot_roborecover.detection.forks.trial import ANOTHER, OWN, Fork, ForkTrial, TeacherForcedRunner

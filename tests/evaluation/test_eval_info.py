@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_roborecover.analysis.intervals import rate_interval, spread
+from lerobot_roborecover.analysis.stats.intervals import rate_interval, spread
 from lerobot_roborecover.evaluation.eval_info import eval_info, success_counts
 from tests.support.trial_rows import trial_row
 

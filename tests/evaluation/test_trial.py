@@ -9,7 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Act, RollbackRequest, Trial, TrialState
+from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Act, RollbackRequest, Trial
+from lerobot_roborecover.evaluation.trial_state import TrialState
 from lerobot_roborecover.logs.row import EvalProtocol
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome

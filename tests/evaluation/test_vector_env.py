@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.vector_env import ScenarioVectorEnv
-from lerobot_roborecover.logs.schema import TRIAL_SCHEMA
+from lerobot_roborecover.logs.fields import TRIAL_SCHEMA
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.workers.messages import SlotConfig

@@ -11,8 +11,8 @@ from unicodedata import normalize
 import pyarrow as pa
 import pytest
 
-from lerobot_roborecover.analysis.estimators import RowsError
 from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.logs.log_file import LogFileError, open_log
 from lerobot_roborecover.logs.row import EvalProtocol

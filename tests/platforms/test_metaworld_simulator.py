@@ -114,7 +114,8 @@ def test_snapshot_continues_like_the_replay(simulator, name):
 
 def test_step_assigns_no_attribute_that_a_snapshot_lacks(simulator):
     """Guards `STEP_ATTRIBUTES` against a task that starts to keep state in Python."""
-    from lerobot_roborecover.platforms.metaworld.simulator import STEP_ATTRIBUTES, metaworld
+    from lerobot_roborecover.platforms.metaworld.scene import STEP_ATTRIBUTES
+    from lerobot_roborecover.platforms.metaworld.simulator import metaworld
 
     covered = {*STEP_ATTRIBUTES, "curr_path_length", "_prev_obs", "_last_stable_obs"}
     views = {"init_left_pad", "init_right_pad"}  # MuJoCo's own body positions, seen through an attribute

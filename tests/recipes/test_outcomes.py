@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.analysis.detection import NEEDS_HELP
+from lerobot_roborecover.analysis.stats.detection import NEEDS_HELP
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from lerobot_roborecover.analysis.agreement import AgreementVerdict, agreement, mixed_rate
-from lerobot_roborecover.analysis.intervals import Estimate
+from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict, agreement, mixed_rate
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.reproduce import find_checkpoint, known_names
 from lerobot_roborecover.reproduce.arms import published_score
 from lerobot_roborecover.reproduce.hours import Costs, run_length

@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.gain_tables import task_gains
-from lerobot_roborecover.analysis.gains import gains_by_group, groups_by_driver
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.macro import macro_9_estimates, macro_estimates
-from lerobot_roborecover.analysis.ranking import pairs_from_both_starts, rank_agreement
-from lerobot_roborecover.analysis.report_tables import initial_estimates
-from lerobot_roborecover.analysis.results import Options, Results, analyse
+from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.policy_tables import initial_estimates
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.macro import macro_9_estimates, macro_estimates
+from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts, rank_agreement
+from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 from lerobot_roborecover.analysis.tables import Column, cell_text
-from lerobot_roborecover.analysis.units import ResamplingUnit
 from lerobot_roborecover.study.definition import read_definition, shipped_study
 from lerobot_roborecover.study.stored import write_stored_logs
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_roborecover.analysis.estimators import DRAWS, draw_counts
-from lerobot_roborecover.analysis.intervals import LEVEL, clean
+from lerobot_roborecover.analysis.stats.estimators import DRAWS, draw_counts
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, clean
 
 
 def bootstrap_interval(

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_roborecover.logs.fields import TRIAL_SCHEMA
 from lerobot_roborecover.logs.row import TrialRow
-from lerobot_roborecover.logs.schema import TRIAL_SCHEMA
 
 CELLS = [
     ("Approach", "Wrong Pose"),

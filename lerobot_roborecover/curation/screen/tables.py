@@ -47,9 +47,9 @@ def format_settled(found: Sequence[Screened]) -> str:
 def format_policies(found: Sequence[Screened]) -> str:
     """Each policy's recovery rate over all screened scenarios, and over those that stay, as text.
 
-    Rates weigh scenarios equally; intervals are those of every table (`analysis/intervals.py`), over the
-    platform's units. A policy that has not tried every scenario as often as the rule says has no rate: those
-    that it tried are those that others left open.
+    Rates weigh scenarios equally; intervals are those of every table (`analysis/stats/intervals.py`), over
+    the platform's units. A policy that has not tried every scenario as often as the rule says has no rate:
+    those that it tried are those that others left open.
     """
     kept = [s for s in found if s.decision.verdict == "kept"]
     names = sorted({name for s in found for name in s.counts})
@@ -68,8 +68,8 @@ def _invalid(count: PolicyCount) -> int:
 
 
 def _rate(found: Sequence[Screened], policy: str) -> str:
+    from lerobot_roborecover.analysis.stats.units import default_unit, unit_labels
     from lerobot_roborecover.analysis.summary import rate_estimate
-    from lerobot_roborecover.analysis.units import default_unit, unit_labels
 
     if not found:
         return "n/a"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import MATCHED, note_of
+from lerobot_roborecover.analysis.stats.fork_gain import MATCHED, note_of
 from lerobot_roborecover.curation.continuations import from_rollouts
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions

@@ -20,14 +20,8 @@ from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.platforms.libero.settle import leading_no_ops
 from lerobot_roborecover.platforms.robotwin.limits import ACTION_DIMS, STEP_LIMITS
-from lerobot_roborecover.scenario import (
-    MAX_ACTION_MAGNITUDE,
-    MAX_PREFIX_STEPS,
-    Reset,
-    Scenario,
-    ScenarioError,
-    Task,
-)
+from lerobot_roborecover.rollout import MAX_ACTION_MAGNITUDE, MAX_PREFIX_STEPS
+from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
 
 LIBERO_SEED = 7
 """The release resets every LIBERO scenario with `env.seed(7)`."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.monitor import MonitorFrames
+from lerobot_roborecover.analysis.stats.monitor import MonitorFrames
 from lerobot_roborecover.datasets.lerobot_folder import open_lerobot_folder
 from lerobot_roborecover.datasets.trajectories import LABEL, ScenarioLink, TrajectorySet, read_trajectories
 from lerobot_roborecover.detection.data.data import STEP, check_disjoint

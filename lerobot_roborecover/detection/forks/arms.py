@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_roborecover.analysis.fork_gain import CONTINUE
+from lerobot_roborecover.analysis.stats.fork_gain import CONTINUE
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import FORK
+from lerobot_roborecover.analysis.stats.fork_gain import FORK
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log

@@ -1,8 +1,8 @@
 """Runs forks through the engine: one log, one pool of simulators, an arm after the other.
 
 Arms are different policies, loaded one at a time; the forks of an arm run at once. The log is an ordinary
-trial log whose rows say in `options.fork` which fork they are of (`analysis.fork_gain.ForkNote`), so a rerun
-goes on where it was interrupted, and more steps, arms or repeats can be added later.
+trial log whose rows say in `options.fork` which fork they are of (`analysis.stats.fork_gain.ForkNote`), so a
+rerun goes on where it was interrupted, and more steps, arms or repeats can be added later.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_roborecover.analysis.fork_gain import CONTINUE, FORK, MATCHED
-from lerobot_roborecover.analysis.labels import settings_differences
+from lerobot_roborecover.analysis.stats.fork_gain import CONTINUE, FORK, MATCHED
+from lerobot_roborecover.analysis.stats.labels import settings_differences
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, env_config
 from lerobot_roborecover.detection.forks.arms import ForkArm
 from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, rows_of, usable, with_actions

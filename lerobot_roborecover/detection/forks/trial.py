@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.analysis.fork_gain import FORK, MATCHED, ForkNote
+from lerobot_roborecover.analysis.stats.fork_gain import FORK, MATCHED, ForkNote
 from lerobot_roborecover.detection.forks.arms import ForkArm
 from lerobot_roborecover.detection.forks.parents import LoggedTrial
 from lerobot_roborecover.evaluation.session import EvalSession

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lerobot_roborecover.platforms.base import SimulatorSetup, no_video
+from lerobot_roborecover.platforms.base import SimulatorSetup
+from lerobot_roborecover.platforms.env_options import no_video
 from lerobot_roborecover.platforms.plain_config import StateEnvConfig
 
 

@@ -13,7 +13,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup, VideoEnvMixin, no_video
+from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup, VideoEnvMixin
+from lerobot_roborecover.platforms.env_options import no_video
 from lerobot_roborecover.platforms.lerobot.known import KNOWN
 from lerobot_roborecover.platforms.lerobot.platform import DEFAULT_TYPE, HUB_TYPE, member_name
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, check_hub

@@ -12,9 +12,8 @@ from lerobot.processor.env_processor import LiberoProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import (
-    SimulatorSetup,
-    VideoEnvMixin,
+from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
+from lerobot_roborecover.platforms.env_options import (
     check_quality,
     chosen_quality,
     first_camera,

@@ -8,9 +8,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import MetaworldEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
-from lerobot_roborecover.platforms.base import (
-    SimulatorSetup,
-    VideoEnvMixin,
+from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
+from lerobot_roborecover.platforms.env_options import (
     check_quality,
     chosen_quality,
     first_camera,

@@ -15,7 +15,6 @@ Non-obvious behaviours this file deals with (metaworld 3.0.0):
 from __future__ import annotations
 
 import copy
-import os
 import sys
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -30,6 +29,14 @@ from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from lerobot_roborecover.platforms.limits import Workspace
 from lerobot_roborecover.platforms.metaworld.marks import handled_body, marks
+from lerobot_roborecover.platforms.metaworld.scene import (
+    STEP_ATTRIBUTES,
+    movable_bodies,
+    render_frame,
+    set_attributes,
+    step_attributes,
+    xyzw,
+)
 from lerobot_roborecover.platforms.mujoco_state import (
     hash_arrays,
     load_state,
@@ -52,15 +59,6 @@ _FINGERS_M = 0.05
 
 _CORNER2_POSITION_M = (0.75, 0.075, 0.7)
 """Where LeRobot's MetaworldEnv moves the corner2 camera."""
-
-STEP_ATTRIBUTES = (
-    "pickCompleted",
-    "placeCompleted",
-    "reachCompleted",
-    "_target_to_obj_init",
-    "_did_see_sim_exception",
-)
-"""Python attributes that the fifty tasks' `step` assigns besides observation stack and step counter."""
 
 
 class MetaworldSimulator:
@@ -137,14 +135,14 @@ class MetaworldSimulator:
                 "positions from a seed, so the scenario's reset must name one (0 to 2^32 - 1)"
             )
         env = self._env = self._env_of(task.name)
-        self._tracked = _movable(env.model)
+        self._tracked = movable_bodies(env.model)
         self._parts = {name: subtree(env.model, [body]) for name, body in self._tracked.items()}
         self._fingers = [subtree(env.model, [env.model.body(f"{side}claw").id]) for side in ("right", "left")]
         # Meta-World's reset lays out the scene twice, and the first time starts from whatever state came
         # before: the first frame shows the goal marker some 0.01 mm off. Start from the freshly built state.
         mujoco.mj_resetData(env.model, env.data)
         env.model.body_pos[:], env.model.site_pos[:] = self._first_layouts[task.name]
-        _set_attributes(env, self._first_attributes[task.name])
+        set_attributes(env, self._first_attributes[task.name])
         env._freeze_rand_vec = False
         env.seeded_rand_vec = True
         env.seed(reset.seed)
@@ -179,9 +177,9 @@ class MetaworldSimulator:
     def _distance_now(self) -> float:
         """`obj_to_target` of the present state; what working it out changes in the task is put back."""
         env = self._ready()
-        before = _attributes(env)
+        before = step_attributes(env)
         _, info = env.evaluate_state(self._raw, np.zeros(self.action_dim, np.float32))
-        _set_attributes(env, before)
+        set_attributes(env, before)
         return float(info["obj_to_target"])
 
     def observe(self) -> Observation:
@@ -203,7 +201,7 @@ class MetaworldSimulator:
             SimulatorError: there is no OpenGL context to be had.
         """
         if self._frame is None:
-            image = _render(self._ready())
+            image = render_frame(self._ready())
             # corner2 looks at the table upside down and mirrored; LeRobot turns it by 180 degrees.
             self._frame = np.flip(image, (0, 1)) if self._camera == "corner2" else image
         return self._frame.copy()
@@ -238,9 +236,9 @@ class MetaworldSimulator:
         them the marks of `metaworld_marks`."""
         env = self._ready()
         data = env.data if self._first is None else self._first
-        poses = {"eef": Pose(tuple(env.tcp_center), _xyzw(data.body("hand").xquat))}
+        poses = {"eef": Pose(tuple(env.tcp_center), xyzw(data.body("hand").xquat))}
         for name, body in self._tracked.items():
-            poses[name] = Pose(tuple(data.xipos[body]), _xyzw(data.xquat[body]))
+            poses[name] = Pose(tuple(data.xipos[body]), xyzw(data.xquat[body]))
         return poses | marks(self._task_name, self._handled, self._raw, self._behind)
 
     def state_sha256(self) -> str:
@@ -251,7 +249,7 @@ class MetaworldSimulator:
     def snapshot(self) -> bytes:
         """See `Simulator.snapshot`; some 4 KB."""
         env = self._ready()
-        attributes = {f"attribute.{k}": np.array(v) for k, v in _attributes(env).items() if v is not None}
+        attributes = {f"attribute.{k}": np.array(v) for k, v in step_attributes(env).items() if v is not None}
         return pack_arrays(
             state=save_state(env.model, env.data),
             path_length=np.array(env.curr_path_length),
@@ -277,7 +275,7 @@ class MetaworldSimulator:
         env.curr_path_length = int(arrays["path_length"])
         env._prev_obs = arrays["previous"]
         attributes = {k: arrays.get(f"attribute.{k}") for k in STEP_ATTRIBUTES if hasattr(env, k)}
-        _set_attributes(env, {k: None if v is None else v.item() for k, v in attributes.items()})
+        set_attributes(env, {k: None if v is None else v.item() for k, v in attributes.items()})
         self._raw = arrays["raw"]
         self._success = bool(arrays["success"])
         self._frame = None
@@ -346,58 +344,9 @@ class MetaworldSimulator:
         env._partially_observable = False
         env.__dict__.pop("sawyer_observation_space", None)
         env.max_path_length = sys.maxsize
-        self._first_attributes[name] = _attributes(env)
+        self._first_attributes[name] = step_attributes(env)
         self._first_layouts[name] = env.model.body_pos.copy(), env.model.site_pos.copy()
         self._envs[name] = env
         while len(self._envs) > _KEPT_ENVS:
             self._envs.popitem(last=False)[1].close()
         return env
-
-
-def _attributes(env: SawyerXYZEnv) -> dict[str, Any]:
-    return {name: getattr(env, name) for name in STEP_ATTRIBUTES if hasattr(env, name)}
-
-
-def _set_attributes(env: SawyerXYZEnv, values: Mapping[str, Any]) -> None:
-    for name, value in values.items():
-        setattr(env, name, value)
-
-
-def _xyzw(quat_wxyz: np.ndarray) -> tuple[float, float, float, float]:
-    w, x, y, z = quat_wxyz
-    return (x, y, z, w)
-
-
-def _movable(model: mujoco.MjModel) -> dict[str, int]:
-    """Ids by name of the bodies with a joint of their own that are not the robot's.
-
-    Meta-World leaves some of them unnamed (dial, puck, thermos): those go by their nearest named ancestor.
-    """
-    robot = subtree(model, [model.body("base").id, model.body("mocap").id])
-    found: dict[str, int] = {}
-    for body in range(1, model.nbody):
-        if body in robot or not model.body_jntnum[body]:
-            continue
-        named = body
-        while not model.body(named).name:
-            named = int(model.body_parentid[named])
-        name = model.body(named).name
-        found[name if name not in found else f"{name}.{body}"] = body
-    return found
-
-
-def _render(env: SawyerXYZEnv) -> np.ndarray:
-    if sys.platform.startswith("linux") and not (os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY")):
-        os.environ["MUJOCO_GL"] = "egl"  # Gymnasium would take GLFW, which makes no context without a display
-    try:
-        renderer = env.mujoco_renderer
-        if renderer.viewer is not None:
-            renderer.viewer.make_context_current()
-        return env.render()
-    except Exception as err:  # each OpenGL backend raises its own types
-        raise SimulatorError(
-            f"Meta-World could not render ({type(err).__name__}: {err}) with MUJOCO_GL="
-            f"{os.environ.get('MUJOCO_GL', '')!r}. Install EGL (Debian: libegl1 libegl-mesa0 "
-            "libgl1-mesa-dri) or OSMesa (libosmesa6, MUJOCO_GL=osmesa), or use obs_type='state', which needs "
-            "no OpenGL"
-        ) from err

@@ -22,13 +22,8 @@ from lerobot_roborecover.platforms.stepping import follow
 from lerobot_roborecover.replay.recorder import Recorder
 from lerobot_roborecover.replay.rollback import RollbackHistory
 from lerobot_roborecover.replay.snapshots import SnapshotCache
-from lerobot_roborecover.scenario import (
-    MAX_PREFIX_STEPS,
-    DeviationType,
-    Pose,
-    ScenarioError,
-    Stage,
-)
+from lerobot_roborecover.rollout import MAX_PREFIX_STEPS
+from lerobot_roborecover.scenario import DeviationType, Pose, ScenarioError, Stage
 from lerobot_roborecover.web.teleop.starts import StartPoint
 from lerobot_roborecover.web.teleop.store import Recorded, lacking
 

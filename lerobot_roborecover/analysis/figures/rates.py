@@ -1,0 +1,275 @@
+"""Figures of rates: forest, rank transition, cells, source × recovery, paired differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from lerobot_roborecover.analysis.figures.runs import runs_figure
+from lerobot_roborecover.analysis.figures.style import (
+    HEAT,
+    INK,
+    LINE,
+    ON_COLOUR,
+    ON_LIGHT,
+    PAPER,
+    SOFT,
+    Figure,
+    Plot,
+    Width,
+    both,
+    colour,
+    drawing,
+    marker,
+    name_rows,
+    number,
+    row_height,
+    short,
+)
+from lerobot_roborecover.analysis.figures.trials import interventions, mosaic, oracle_bars, time_to_recover
+from lerobot_roborecover.analysis.policy_tables import initial_estimates
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.stats.groups import group_rates, source_matrix
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+
+
+def all_figures(results: Results) -> list[Figure]:
+    """Every figure that the study has something for."""
+    figures = [forest(results)]
+    if results.several_runs:
+        figures.append(runs_figure(results))
+    several = len(results.recovery.arms) > 1
+    if len(results.matched) > 1:
+        figures.append(rank_transition(results))
+    figures.append(cell_heat_map(results))
+    if matrix := source_matrix(results.recovery, results.draws):
+        figures.append(source_heat_map(results, matrix))
+    if several:
+        figures.append(paired_differences(results))
+    figures.append(time_to_recover(results))
+    if several:
+        figures.append(oracle_bars(results))
+    if results.costs:
+        figures.append(interventions(results))
+    figures.append(mosaic(results))
+    return figures
+
+
+def forest(results: Results) -> Figure:
+    """RSR with intervals, best first; initial-state rates as hollow markers with theirs."""
+    panel, chosen = results.recovery, results.compared.policies
+    rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
+    order = [chosen[p] for p in reversed(results.best_first)]
+    level = f"{100 * results.draws.level:g} % interval"
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.8 + row_height(width, 0.46) * len(order))
+            for y, p in enumerate(order):
+                if not math.isnan(initial[p].value):
+                    at = y - 0.2
+                    if not math.isnan(initial[p].low):
+                        axes.plot([100 * initial[p].low, 100 * initial[p].high], [at, at], color=SOFT, lw=1.2)
+                    axes.plot(100 * initial[p].value, at, "o", color=SOFT, mfc=PAPER, ms=5.5)
+                if not math.isnan(rsr[p].low):
+                    axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=colour(p), lw=3)
+                axes.plot(100 * rsr[p].value, y, marker(p), color=colour(p), ms=9, mec=PAPER, mew=1)
+                value = f"{100 * rsr[p].value:.1f}"
+                if width.narrow:
+                    place = {"xycoords": ("axes fraction", "data"), "ha": "right"}
+                    axes.annotate(value, (1, y), (0, 9), textcoords="offset points", fontsize=9.5, **place)
+                else:
+                    at = 100 * rsr[p].value, y
+                    axes.annotate(value, at, (0, 8), textcoords="offset points", ha="center", fontsize=9)
+            name_rows(axes, [short(panel.arms[p], width.names) for p in order], width)
+            axes.set(xlim=(-1, 101), ylim=(-0.6, len(order) - 0.15))
+            hollow = any(not math.isnan(e.value) for e in initial)
+            texts = [f"RSR, %, with {level}", "hollow: from initial states"][: 1 + hollow]
+            axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
+            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.set_axisbelow(True)
+            axes.spines["left"].set_visible(False)
+        return plot
+
+    words = "; ".join(f"{panel.arms[p]} {_words(rsr[p])}" for p in reversed(order))
+    text = f"RSR in per cent, best first: {words}."
+    if results.left_out:
+        text += f" Not ranked, because not run on all scenarios: {', '.join(results.left_out)}."
+    return Figure("forest", "Recovery success rate", text, *both(draw))
+
+
+def _words(estimate: Estimate) -> str:
+    if math.isnan(estimate.low):
+        return f"{100 * estimate.value:.1f}"
+    return f"{100 * estimate.value:.1f} ({100 * estimate.low:.1f} to {100 * estimate.high:.1f})"
+
+
+def rank_transition(results: Results) -> Figure:
+    """Ranks from initial states against ranks at recovery."""
+    index = results.matched
+    first, second = results.both_starts
+    names, initial, recovery = first.policies, first.means, second.means
+    left, right = _ranks(initial), _ranks(recovery)
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.7 + 0.42 * len(index))
+            for k, p in enumerate(index):
+                axes.plot([0, 1], [left[k], right[k]], marker(p), ls="-", color=colour(p), lw=2.2, ms=8.5)
+                name = short(names[k], 12 if width.narrow else width.names)
+                gap = 0.1 if width.narrow else 0.04
+                before = f"{100 * initial[k]:.1f}" if width.narrow else f"{name}   {100 * initial[k]:.1f}"
+                axes.text(-gap, left[k], before, ha="right", va="center")
+                axes.text(1 + gap, right[k], f"{100 * recovery[k]:.1f}   {name}", ha="left", va="center")
+            axes.set(
+                xlim=(-0.45, 1.95) if width.narrow else (-0.75, 1.75), ylim=(len(index) + 0.5, 0.5),
+                xticks=[0, 1], xticklabels=["initial state, %", "recovery, %"], yticks=[],
+            )  # fmt: skip
+            axes.spines[:].set_visible(False)
+            axes.tick_params(length=0, labelcolor=SOFT)
+        return plot
+
+    order = ", ".join(names[k] for k in np.argsort(left)), ", ".join(names[k] for k in np.argsort(right))
+    text = f"Order from initial states: {order[0]}. Order at recovery: {order[1]}."
+    return Figure("rank_transition", "From initial-state rank to recovery rank", text, *both(draw))
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """1 is the highest; ties in the order given, so that no two labels overlap."""
+    ranks = np.empty(len(values))
+    ranks[np.argsort(-values, kind="stable")] = np.arange(1, len(values) + 1)
+    return ranks
+
+
+def cell_heat_map(results: Results) -> Figure:
+    """Cells × policies; sparse cells hatched and pale, counts in the labels."""
+    groups = group_rates(results.recovery, "cell", results.draws)
+    labels = [f"{g.label.replace('-', ', ', 1)}  (N={g.scenarios})" for g in groups]
+    values = np.array([[e.value for e in g.estimates] for g in groups])
+    sparse = [g.underpowered for g in groups]
+    plots = _heat_map(values, labels, results.recovery.arms, sparse)
+    words = "; ".join(
+        f"{label}: "
+        f"{', '.join(f'{a} {number(100 * v)}' for a, v in zip(results.recovery.arms, row, strict=True))}"
+        for label, row in zip(labels, values, strict=True)
+    )
+    return Figure("cells", "Recovery by stage and deviation type", f"RSR in per cent. {words}.", *plots)
+
+
+def source_heat_map(results: Results, matrix: Sequence) -> Figure:
+    """Source policies × recovery policies."""
+    labels = [f"{short(row.source_policy)}  (N={row.scenarios})" for row in matrix]
+    values = np.array([[e.value for e in row.rates] for row in matrix])
+    solid = [(i, row.own) for i, row in enumerate(matrix) if row.own is not None]
+    dashed = [(i, row.best_other) for i, row in enumerate(matrix) if row.best_other is not None]
+    sparse = [row.underpowered for row in matrix]
+    plots = _heat_map(values, labels, results.recovery.arms, sparse, solid, dashed)
+    words = "; ".join(
+        f"scenarios of {row.source_policy}: best other {results.recovery.arms[row.best_other]} "
+        f"{number(100 * row.rates[row.best_other].value)}"
+        + (f", itself {number(100 * row.rates[row.own].value)}" if row.own is not None else "")
+        for row in matrix
+        if row.best_other is not None
+    )
+    text = f"RSR in per cent; solid outline: the source policy itself, dashed: observed best other. {words}"
+    return Figure("source_matrix", "Who recovers from whose deviations", text, *plots)
+
+
+def _heat_map(
+    values: np.ndarray,
+    labels: Sequence[str],
+    policies: Sequence[str],
+    sparse: Sequence[bool],
+    solid: Sequence[tuple[int, int]] = (),
+    dashed: Sequence[tuple[int, int]] = (),
+) -> tuple[Plot, Plot]:
+    """Rows × policies as coloured fields with their numbers, wide and narrow."""
+    from matplotlib import colormaps
+    from matplotlib.patches import Rectangle
+
+    shades = colormaps[HEAT]
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            tall = row_height(width, 0.44)
+            plot, axes = subplots(width.inches, 0.9 + tall * len(labels) + 0.25 * width.narrow)
+            for i, j in np.ndindex(values.shape):
+                known = math.isfinite(values[i, j])
+                low = 0.16 if width.narrow else 0.46
+                field = Rectangle(
+                    (j - 0.48, i - low), 0.96, low + 0.46, fc=shades(values[i, j]) if known else "none",
+                    ec=LINE if not known or sparse[i] else "none", lw=0.8, alpha=0.55 if sparse[i] else 1,
+                    hatch="...." if sparse[i] and known else None,
+                )  # fmt: skip
+                axes.add_patch(field)
+                dark = known and values[i, j] < 0.55
+                text = axes.text(
+                    j, i + (0.46 - low) / 2, number(100 * values[i, j]), ha="center", va="center",
+                    color=ON_COLOUR if dark else ON_LIGHT if known else SOFT,
+                )  # fmt: skip
+                if sparse[i] and known:
+                    text.set_bbox({"fc": shades(values[i, j]), "ec": "none", "pad": 1.5})
+            for cells, style in ((dashed, (0, (4, 2))), (solid, "-")):
+                for i, j in cells:
+                    low = 0.12 if width.narrow else 0.42
+                    corner, size = (j - 0.44, i - low), (0.88, low + 0.42)
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec=ON_COLOUR, lw=4))
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec="#d55e00", lw=2, ls=style))
+            tilt = {"rotation": 30, "ha": "left", "rotation_mode": "anchor"} if width.narrow else {}
+            limit = 14 if width.narrow else max(8, int(120 / len(policies)))
+            axes.set_xticks(range(len(policies)), [short(p, limit) for p in policies], **tilt)
+            axes.xaxis.tick_top()
+            if width.narrow:
+                axes.set_yticks([])
+                for i, label in enumerate(labels):
+                    axes.text(-0.48, i - 0.22, label, va="bottom", fontsize=9.5)
+            else:
+                axes.set_yticks(range(len(labels)), labels)
+            axes.set(xlim=(-0.5, len(policies) - 0.5), ylim=(len(labels) - 0.5, -0.62))
+            axes.tick_params(length=0, labelcolor=INK)
+            axes.spines[:].set_visible(False)
+        return plot
+
+    return both(draw)
+
+
+def paired_differences(results: Results) -> Figure:
+    """All pairs with their intervals; separated ones filled."""
+    pairs = set(results.shown_pairs)
+    every = zip(combinations(range(len(results.recovery.arms)), 2), results.contrasts, strict=True)
+    found = sorted((c for pair, c in every if pair in pairs), key=lambda c: c.difference.value)
+    shown = [c for c in found if not math.isnan(c.difference.value)]
+    level = f"{100 * results.draws.level:g} % interval"
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.9 + row_height(width, 0.3) * max(1, len(shown)))
+            axes.axvline(0, color=SOFT, lw=1)
+            for y, c in enumerate(shown):
+                d = c.difference
+                clear = c.verdict.separated
+                shade = colour(0) if clear else SOFT
+                if not math.isnan(d.low):
+                    axes.plot([100 * d.low, 100 * d.high], [y, y], color=shade, lw=2.2)
+                axes.plot(100 * d.value, y, "o", color=shade, mfc=shade if clear else PAPER, ms=7)
+            limit = 15 if width.narrow else 22
+            name_rows(axes, [f"{short(c.a, limit)} − {short(c.b, limit)}" for c in shown], width)
+            axes.set(ylim=(-0.7, max(1, len(shown)) - (0.1 if width.narrow else 0.3)))
+            texts = f"RSR, A − B, points, with {level}", "filled: separated (Holm)"
+            axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
+            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.set_axisbelow(True)
+            axes.spines["left"].set_visible(False)
+        return plot
+
+    clear = [c for c in shown if c.verdict.separated]
+    text = f"{len(clear)} of {len(shown)} pairs are separated after adjustment for their number (Holm)."
+    if len(shown) < len(results.contrasts):
+        text = (
+            f"{results.recovery.arms[0]} against every other policy: {text} The table has all "
+            f"{len(results.contrasts)} pairs."
+        )
+    return Figure("paired_differences", "Paired differences in RSR", text, *both(draw))

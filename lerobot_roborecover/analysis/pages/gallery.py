@@ -1,0 +1,227 @@
+"""The scenario gallery: what each scenario looks like and how every policy did on it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.scenario import Outcome, Scenario
+
+SIGNS = {"success": "●", "failure": "○", "invalid": "!"}
+"""Told apart by shape, not by colour."""
+OUTCOME_CLASSES = {
+    "split": "some policies solve it",
+    "none": "no policy solves it",
+    "all": "every policy solves it",
+    "invalid": "has invalid trials",
+}
+"""What the gallery's outcome filter offers; a scenario may be in several."""
+
+
+@dataclass(frozen=True)
+class PolicyMarks:
+    """One policy on one scenario."""
+
+    policy: str
+    signs: str
+    """One sign a trial, in their order."""
+    words: str
+    """The same for readers without the signs."""
+    initial: str = ""
+    """Signs of the trials from the initial state; empty where there are none."""
+    rate: float | None = None
+    """Share of its trials that solved it, in [0, 1]; None where it was not run."""
+
+
+@dataclass(frozen=True)
+class TrialVideo:
+    """A video of one trial, or a recording for the rerun viewer."""
+
+    policy: str
+    uri: str
+    """Data URI, or the file's path from the page."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether the rerun viewer shows it, and not the browser."""
+        return self.uri.endswith(".rrd")
+
+
+@dataclass(frozen=True)
+class Card:
+    """One scenario."""
+
+    id: str
+    instruction: str
+    task: str
+    suite: str
+    cell: str
+    source: str
+    source_policy: str
+    frame: str
+    """Data URI of the recovery frame, or its file's path from the page; empty where there is none."""
+    marks: tuple[PolicyMarks, ...]
+    clips: tuple[TrialVideo, ...]
+    outcome_classes: tuple[str, ...]
+    disagreement: float
+    """Standard deviation of the policies' rates, in [0, 0.5]."""
+    rate: float
+    """Mean of the policies' rates."""
+
+
+def make_cards(
+    panel: Panel,
+    frames: Mapping[str, bytes | str],
+    clips: Mapping[str, Sequence[TrialVideo]],
+    initial: Panel | None = None,
+) -> list[Card]:
+    """Cards of all scenarios, those on which policies disagree most first.
+
+    Args:
+        panel: trials from recovery points.
+        frames: PNG or JPEG files by scenario id: their content, or their path from the page.
+        clips: videos by scenario id.
+        initial: trials of the same policies from initial states.
+    """
+    before = _initial_rows(initial)
+    cards = []
+    for n, scenario in enumerate(panel.scenarios):
+        rates = panel.rates[:, n]
+        run = rates[np.isfinite(rates)]
+        cards.append(
+            Card(
+                id=scenario.id,
+                instruction=scenario.instruction,
+                task=scenario.task,
+                suite=scenario.suite,
+                cell=scenario.cell.replace("-", ", ", 1),
+                source=scenario.source,
+                source_policy=scenario.source_policy,
+                frame=_image_uri(frames.get(scenario.id, "")),
+                marks=tuple(
+                    _marks(
+                        panel.arms[p],
+                        panel.rows.get((p, n), ()),
+                        int(panel.trials[p, n]),
+                        before.get((panel.arms[p], scenario.id), ()),
+                    )
+                    for p in range(len(panel.arms))
+                ),
+                clips=tuple(clips.get(scenario.id, ())),
+                outcome_classes=_classes(run, bool(panel.invalid[:, n].any())),
+                disagreement=float(run.std()),
+                rate=float(run.mean()),
+            )
+        )
+    return sorted(cards, key=lambda card: (-card.disagreement, card.id))
+
+
+def _classes(rates: np.ndarray, invalid: bool) -> tuple[str, ...]:
+    solved = rates > 0
+    kind = "all" if solved.all() else "split" if solved.any() else "none"
+    return (kind, "invalid") if invalid else (kind,)
+
+
+def _initial_rows(panel: Panel | None) -> Mapping[tuple[str, str], Sequence[TrialRow]]:
+    """Rows from initial states by policy and scenario id."""
+    if panel is None:
+        return {}
+    found: dict[tuple[str, str], list[TrialRow]] = {}
+    for (p, _), rows in panel.rows.items():
+        for row in rows:
+            found.setdefault((panel.arms[p], row.scenario_id), []).append(row)
+    return found
+
+
+_VALID = frozenset(outcome.value for outcome in Outcome if outcome.valid)
+
+
+def _kinds(rows: Sequence[TrialRow]) -> list[str]:
+    return ["success" if r.success else "failure" if r.outcome in _VALID else "invalid" for r in rows]
+
+
+def _marks(policy: str, rows: Sequence[TrialRow], scheduled: int, initial: Sequence[TrialRow]) -> PolicyMarks:
+    before = _kinds(initial)
+    from_start = f"; from the initial state {before.count('success')} of {len(before)}" if before else ""
+    signs = "".join(SIGNS[kind] for kind in before)
+    if not scheduled:
+        return PolicyMarks(policy, "", f"not run{from_start}", signs)
+    kinds = _kinds(rows)
+    missing = scheduled - len(rows)
+    words = f"solved {kinds.count('success')} of {scheduled} trials"
+    if missing:
+        words += f", {missing} without a row"
+    for row in rows:
+        if row.outcome not in _VALID:
+            why = f", {row.reason}" if row.reason else ""
+            words += f"; trial {row.trial}: {row.outcome.replace('_', ' ')}{why}"
+    shown = "".join(SIGNS[kind] for kind in kinds) + "–" * missing
+    return PolicyMarks(policy, shown, words + from_start, signs, kinds.count("success") / scheduled)
+
+
+def _image_uri(data: bytes | str) -> str:
+    if isinstance(data, str):
+        return data
+    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def gallery_values(cards: Sequence[Card]) -> dict[str, Any]:
+    """What the gallery's template asks for.
+
+    Args:
+        cards: of `make_cards`.
+    """
+    present = {kind for card in cards for kind in card.outcome_classes}
+    policies = list(dict.fromkeys(mark.policy for card in cards for mark in card.marks))
+    return {
+        "cards": cards,
+        "both_starts": any(mark.initial for card in cards for mark in card.marks),
+        "choices": {
+            key: sorted({getattr(card, key) for card in cards}) for key in ("cell", "source", "suite")
+        },
+        "outcome_classes": {k: v for k, v in OUTCOME_CLASSES.items() if k in present},
+        "signs": SIGNS,
+        "policies": policies,
+    }
+
+
+def check_scenarios(trials: Iterable[TrialRow], scenarios: Sequence[Scenario], name: str) -> list[str]:
+    """Compares trials with the scenario set they are said to be on.
+
+    Args:
+        trials: from the logs.
+        scenarios: the set.
+        name: what to call it.
+
+    Returns:
+        Remarks: scenarios of the set without any trial.
+
+    Raises:
+        RowsError: a row's scenario is not in the set, or is another one of the same name.
+    """
+    known = {s.id: s.sha256() for s in scenarios}
+    rows = {row.scenario_id: row for row in trials}
+    unknown = sorted(set(rows) - set(known))
+    if unknown:
+        raise RowsError(
+            f"the logs have trials on {len(unknown)} scenario(s) that {name} lacks, e.g. "
+            f"{unknown[0]} (from dataset "
+            f"{rows[unknown[0]].dataset}). Name the set that was evaluated, or leave --scenarios out"
+        )
+    changed = sorted(i for i, row in rows.items() if row.scenario_sha256 != known[i])
+    if changed:
+        raise RowsError(
+            f"{len(changed)} scenario(s) differ between the logs and {name}, e.g. {changed[0]}: the "
+            "set was changed "
+            "after the evaluation. Name the revision that was evaluated"
+        )
+    idle = sorted(set(known) - set(rows))
+    return [f"{len(idle)} of {len(known)} scenarios of {name} have no trial, e.g. {idle[0]}"] if idle else []

@@ -1,0 +1,84 @@
+"""Videos and recordings of trials, found by the names that the commands give them."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_roborecover.analysis.pages.gallery import TrialVideo
+from lerobot_roborecover.analysis.stats.estimators import RowsError
+
+_OF_A_FOLDER = ("eval_episode_0.mp4", "replay.rrd")
+"""Files that are called alike for all scenarios: the folder names the scenario."""
+_TRIAL = re.compile(r"(?P<id>.+)_trial(?P<trial>\d+)(_\w+)?")
+
+
+def find_media(folder: Path, ids: Sequence[str]) -> dict[str, Path]:
+    """A video or recording of each scenario, the first trial's where there are several.
+
+    Taken are `<group>_<scenario>/eval_episode_0.mp4` of `lerobot-eval`, `<scenario>_trial<k>_<outcome>.mp4`
+    of `roborecover eval`, `<scenario>/replay.rrd` of `dataset inspect`, and `<scenario>.mp4` or `.rrd`.
+
+    Args:
+        folder: where they are, at any depth.
+        ids: scenarios to look for.
+
+    Returns:
+        Files by scenario id.
+
+    Raises:
+        RowsError: the folder does not exist.
+    """
+    if not folder.is_dir():
+        raise RowsError(f"no folder of videos at {folder}")
+    named: dict[str, list[tuple[int, Path]]] = {}
+    grouped: list[tuple[str, Path]] = []
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in (".mp4", ".rrd")):
+        if path.name in _OF_A_FOLDER:
+            grouped.append((path.parent.name, path))
+            continue
+        match = _TRIAL.fullmatch(path.stem)
+        name, trial = (match["id"], int(match["trial"])) if match else (path.stem, 0)
+        named.setdefault(name, []).append((trial, path))
+    found = {}
+    for scenario_id in ids:
+        mine = [path for name, path in grouped if name == scenario_id or name.endswith(f"_{scenario_id}")]
+        mine += [path for _, path in sorted(named.get(scenario_id, ()))]
+        if mine:
+            found[scenario_id] = mine[0]
+    return found
+
+
+def find_clips(
+    folders: Sequence[tuple[str, Path]], ids: Sequence[str], limit_bytes: int
+) -> tuple[dict[str, list[TrialVideo]], list[str]]:
+    """Videos to put into a page.
+
+    Args:
+        folders: name of the policy and where its videos are, at any depth.
+        ids: scenarios to look for.
+        limit_bytes: total size to take in; the rest is left out, and said.
+
+    Returns:
+        Clips by scenario id, and remarks.
+
+    Raises:
+        RowsError: a folder does not exist.
+    """
+    clips: dict[str, list[TrialVideo]] = {}
+    used = skipped = 0
+    for name, folder in folders:
+        for scenario_id, path in find_media(folder, ids).items():
+            size = path.stat().st_size
+            if path.suffix != ".mp4" or used + size > limit_bytes:
+                skipped += 1
+                continue
+            used += size
+            data = base64.b64encode(path.read_bytes()).decode()
+            clips.setdefault(scenario_id, []).append(TrialVideo(name, f"data:video/mp4;base64,{data}"))
+    if skipped:
+        limit = f"all together exceed {limit_bytes // 2**20} MiB"
+        return clips, [f"{skipped} video(s) are left out: {limit}, or are no .mp4"]
+    return clips, []
