@@ -160,7 +160,7 @@ class RecoveryBenchmark(StepBenchmark):
         self._trial = trial
         slot = self._slot()
         slot.send("reset", trial.begin())
-        trial.take(slot.receive())
+        trial.on_reply(slot.receive())
         return self._after(trial)
 
     def step(self, action: Mapping[str, Any]) -> StepResult:
@@ -177,13 +177,13 @@ class RecoveryBenchmark(StepBenchmark):
             rows = self._translator.actions({self._mapping.actions.key: np.atleast_2d(np.asarray(found))[:1]})
             rows = self._env_post({ACTION: torch.from_numpy(rows)})[ACTION].cpu().numpy()
         except RemoteError as err:
-            trial.refused(err, seconds=seconds)
+            trial.on_policy_error(err, seconds=seconds)
         else:
-            move = trial.decide(rows, seconds=seconds)
+            move = trial.on_actions(rows, seconds=seconds)
             if isinstance(move, Act):
                 slot = self._slot()
                 slot.send("step", move.actions[0])
-                trial.take(slot.receive())
+                trial.on_reply(slot.receive())
         observation = self._after(trial)
         return StepResult(observation, float(trial.success), trial.over, {"outcome": str(trial.outcome)})
 

@@ -250,7 +250,7 @@ class Engine:
         except ReplicaLostError as err:
             if isinstance(err, ReplicaHungError):
                 for active in asked:
-                    active.trial.refused(err, seconds=self._clock() - began)
+                    active.trial.on_policy_error(err, seconds=self._clock() - began)
                     active.replica = None
                     self._finish(active)
             for active in self._sittings_of(replica):
@@ -270,10 +270,10 @@ class Engine:
                 self._away(active, str(chunk))
                 continue
             if isinstance(chunk, PolicyError):
-                trial.refused(chunk, seconds=seconds)
+                trial.on_policy_error(chunk, seconds=seconds)
             else:
                 actions, directives = strip_columns(chunk, self._run.action_width(active.unit.scenario))
-                move = trial.decide(actions, directives, seconds=seconds)
+                move = trial.on_actions(actions, directives, seconds=seconds)
                 active.answered_at, active.answered_with = self._clock(), len(asked)
                 if isinstance(move, Act):
                     slot.send("act", move.actions)
@@ -293,7 +293,7 @@ class Engine:
             return
         if isinstance(reply, ActResult) and not reply.over:
             self._company[active.replica].simulated(active.answered_with, reply.seconds)
-        active.trial.take(reply)
+        active.trial.on_reply(reply)
         if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
             active.recording = self._videos.begin(active.unit, reply.frame, reply.hz)
         elif active.recording is not None and isinstance(reply, ActResult):

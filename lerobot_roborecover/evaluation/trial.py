@@ -1,21 +1,21 @@
 """State machine of one trial, from its reset to its row, shared by both evaluation loops.
 
     NEW -> HANDING_OFF -> WAITING -> ASKED -> ACTING -> WAITING ... -> OVER
-                                           -> GOING_BACK -> WAITING
+                                           -> ROLLING_BACK -> WAITING
 
 1. `begin` returns what a simulator needs to rebuild the start. The simulator replays, compares and observes.
 2. `ask` returns the observation for the policy. After an unfaithful handoff the trial ends before this step,
    so the policy sees nothing of it.
-3. `decide` takes the policy's actions, or its request for a rollback. It rejects a bad action, which is never
+3. `on_actions` takes the policy's actions, or its request for a rollback. It rejects a bad action, which is never
    sent.
-4. `take` takes the simulator's reply. It counts steps and hashes actions; the task's predicate decides
+4. `on_reply` takes the simulator's reply. It counts steps and hashes actions; the task's predicate decides
    success.
 5. `OVER` has an outcome: success, horizon reached, or the reason why the trial is invalid. `row` returns it.
 
 `skip` and `fail` end a trial in any state. The state machine has no clock, process or file. Two loops drive
 it: `evaluation.vector_env` (LeRobot's loop) one action at a time, and `evaluation.scheduler` chunk by chunk.
 The same policy gives the same row in both, because a chunk counts as its single actions. In real-time
-evaluation (`real_time`), `decide` puts the actions executed during the inference before the policy's actions.
+evaluation (`real_time`), `on_actions` puts the actions executed during the inference before the policy's actions.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class Trial:
         assert self.observation is not None
         return self.observation
 
-    def decide(
+    def on_actions(
         self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
     ) -> Act | RollbackRequest | None:
         """Takes the policy's answer in.
@@ -202,7 +202,7 @@ class Trial:
             first = self._directives[0]
             self._record.note(first, self.steps)
             if first.rollback:
-                self.state = TrialState.GOING_BACK
+                self.state = TrialState.ROLLING_BACK
                 return RollbackRequest(first.rollback)
         good = 0
         while good < len(actions) and not self._problem(actions[good]):
@@ -212,7 +212,7 @@ class Trial:
         self._end(Outcome.POLICY_ERROR, self._problem(actions[0]))
         return None
 
-    def refused(self, why: object, *, seconds: float) -> None:
+    def on_policy_error(self, why: object, *, seconds: float) -> None:
         """The policy raised in place of an answer.
 
         Args:
@@ -223,7 +223,7 @@ class Trial:
         self._policy_s += seconds
         self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {why}")
 
-    def take(self, reply: Reply) -> None:
+    def on_reply(self, reply: Reply) -> None:
         """Takes the simulator's reply in."""
         if isinstance(reply, SlotFailure):
             self._leave(*IN_SIMULATOR, to=TrialState.OVER)
@@ -239,7 +239,7 @@ class Trial:
             if reply.handoff.problem is not None:
                 self._end(reply.handoff.problem, reply.handoff.reason)
         elif isinstance(reply, RollbackReply):
-            self._leave(TrialState.GOING_BACK, to=TrialState.WAITING)
+            self._leave(TrialState.ROLLING_BACK, to=TrialState.WAITING)
             self._record.rolled_back(self._directives[0].rollback, reply)
             self._sim_s += reply.seconds
             self.observation = reply.observation

@@ -28,11 +28,11 @@ class TrialState(StrEnum):
     """The policy infers."""
     ACTING = "acting"
     """A simulator executes actions."""
-    GOING_BACK = "going_back"
-    """A simulator is put back to an earlier state."""
+    ROLLING_BACK = "rolling_back"
+    """A simulator is rolled back to an earlier state."""
     OVER = "over"
     """It has an outcome, or was skipped."""
 
 
-IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK)
+IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.ROLLING_BACK)
 """States that a simulator's reply ends."""

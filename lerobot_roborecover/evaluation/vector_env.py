@@ -118,7 +118,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         for trial, slot in begun:
             slot.send("reset", trial.begin())
         for trial, slot in begun:
-            trial.take(slot.receive())
+            trial.on_reply(slot.receive())
             self._record_if_over(trial)
         self._seed_policy_noise(first)
         self._replied = time.perf_counter()
@@ -142,11 +142,11 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
             if trial.over:
                 continue
             if miscounted:
-                trial.refused(miscounted, seconds=waited)
+                trial.on_policy_error(miscounted, seconds=waited)
                 self._record_if_over(trial)
                 continue
             own = directives and directives[index : index + 1]
-            move = trial.decide(actions[index : index + 1], own, seconds=waited)
+            move = trial.on_actions(actions[index : index + 1], own, seconds=waited)
             if move is None:
                 self._record_if_over(trial)
                 continue
@@ -158,7 +158,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
                 slots[index].send("act", move.actions)
             working.append(index)
         for index in working:
-            self._trials[index].take(slots[index].receive())
+            self._trials[index].on_reply(slots[index].receive())
             self._frames[index] = None
             self._record_if_over(self._trials[index])
         success = np.array([t.success for t in self._trials])
@@ -212,7 +212,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         waited = time.perf_counter() - self._replied
         for trial in self._trials:
             if trial.state is TrialState.ASKED:
-                trial.refused(reason, seconds=waited)
+                trial.on_policy_error(reason, seconds=waited)
                 self._record_if_over(trial)
 
     def _with_run_seed(self, seed: int | list[int] | None, first: int) -> EvalProtocol:

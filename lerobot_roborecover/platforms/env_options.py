@@ -51,7 +51,7 @@ def chosen_quality(quality: str) -> dict[str, str]:
 
 
 def no_video(_: Observation) -> np.ndarray:
-    """Frame of a video nobody asked for: grey, so that it is not mistaken for a dark scene."""
+    """Returns a grey frame for a video that was not asked for, unlike any dark scene."""
     return np.full((64, 64, 3), 128, np.uint8)
 
 

@@ -96,7 +96,7 @@ def test_a_policy_that_does_otherwise_is_found():
     def asked(chunk):
         trial = ForkTrial(fork, PROTOCOL, action_width=2)
         trial.state = "asked"
-        return trial, trial.decide(chunk, seconds=0.0)
+        return trial, trial.on_actions(chunk, seconds=0.0)
 
     trial, move = asked(np.full((4, 2), 5e-5, np.float32))
     assert not trial.over

@@ -38,7 +38,7 @@ def new() -> Trial:
 def handed_off(handoff: Handoff = HANDOFF) -> Trial:
     trial = new()
     trial.begin()
-    trial.take(EpisodeStart({"state": 0}, handoff))
+    trial.on_reply(EpisodeStart({"state": 0}, handoff))
     return trial
 
 
@@ -50,7 +50,7 @@ def asked() -> Trial:
 
 def acting(chunk: int = 1) -> Trial:
     trial = asked()
-    trial.decide(np.zeros((chunk, 2)), seconds=0.5)
+    trial.on_actions(np.zeros((chunk, 2)), seconds=0.5)
     return trial
 
 
@@ -64,19 +64,19 @@ def test_a_trial_that_succeeds():
     assert trial.begin().scenario is SCENARIO
     assert trial.state is TrialState.HANDING_OFF
     assert trial.in_simulator
-    trial.take(EpisodeStart({"state": 0}, HANDOFF))
+    trial.on_reply(EpisodeStart({"state": 0}, HANDOFF))
     assert trial.state is TrialState.WAITING
     assert not trial.in_simulator
     assert trial.ask() == {"state": 0}
     assert trial.state is TrialState.ASKED
-    move = trial.decide(np.ones((2, 2)), seconds=0.5)
+    move = trial.on_actions(np.ones((2, 2)), seconds=0.5)
     assert isinstance(move, Act)
     assert move.actions.shape == (2, 2)
     assert trial.state is TrialState.ACTING
-    trial.take(ActResult({"state": 2}, 2, False, False, 0.25))
+    trial.on_reply(ActResult({"state": 2}, 2, False, False, 0.25))
     assert trial.ask() == {"state": 2}
-    trial.decide(np.ones((1, 2)), seconds=0.5)
-    trial.take(StepResult({"state": 3}, True, 0.25))
+    trial.on_actions(np.ones((1, 2)), seconds=0.5)
+    trial.on_reply(StepResult({"state": 3}, True, 0.25))
     assert trial.over
     assert trial.success
     assert trial.outcome is Outcome.SUCCESS
@@ -90,8 +90,8 @@ def test_out_of_steps():
     for _ in range(HORIZON):
         assert not trial.over
         trial.ask()
-        trial.decide(np.zeros((1, 2)), seconds=0.0)
-        trial.take(StepResult({}, False, 0.0))
+        trial.on_actions(np.zeros((1, 2)), seconds=0.0)
+        trial.on_reply(StepResult({}, False, 0.0))
     assert (trial.outcome, trial.steps, trial.success) == (Outcome.HORIZON, HORIZON, False)
 
 
@@ -110,23 +110,23 @@ def test_an_unfaithful_handoff_never_reaches_the_policy():
 def test_a_simulators_failure(kind, outcome):
     early = new()
     early.begin()
-    early.take(SlotFailure(kind, "broke"))
+    early.on_reply(SlotFailure(kind, "broke"))
     assert (early.outcome, early.reason) == (outcome, "at the handoff: broke")
     late = acting()
-    late.take(SlotFailure(kind, "broke"))
+    late.on_reply(SlotFailure(kind, "broke"))
     assert (late.outcome, late.reason, late.steps) == (outcome, "at step 0: broke", 0)
     assert row(late).actions_sha256 == row(early).actions_sha256, "nothing is known to have been executed"
 
 
 def test_a_bad_action_is_not_sent():
     trial = asked()
-    assert trial.decide(np.stack([BAD, BAD]), seconds=0.1) is None
+    assert trial.on_actions(np.stack([BAD, BAD]), seconds=0.1) is None
     assert trial.outcome is Outcome.POLICY_ERROR
     assert "non-finite" in trial.reason
     later = asked()
     move = later.decide(np.stack([np.zeros(2), BAD]), seconds=0.1)
     assert len(move.actions) == 1
-    later.take(ActResult({}, 1, False, False, 0.0))
+    later.on_reply(ActResult({}, 1, False, False, 0.0))
     assert later.outcome is Outcome.POLICY_ERROR
     assert later.steps == 1
     wide = asked()
@@ -136,38 +136,38 @@ def test_a_bad_action_is_not_sent():
 
 def test_success_before_a_bad_action_is_success():
     trial = asked()
-    trial.decide(np.stack([np.zeros(2), BAD]), seconds=0.1)
-    trial.take(ActResult(None, 1, True, True, 0.0))
+    trial.on_actions(np.stack([np.zeros(2), BAD]), seconds=0.1)
+    trial.on_reply(ActResult(None, 1, True, True, 0.0))
     assert trial.outcome is Outcome.SUCCESS
 
 
 def test_a_policy_that_raises():
     trial = asked()
-    trial.refused("no CUDA", seconds=0.25)
+    trial.on_policy_error("no CUDA", seconds=0.25)
     assert (trial.outcome, trial.reason) == (Outcome.POLICY_ERROR, "at step 0: no CUDA")
     assert row(trial).policy_s == 0.25
 
 
 def test_going_back():
     trial = acting()
-    trial.take(StepResult({"state": 1}, False, 0.0))
+    trial.on_reply(StepResult({"state": 1}, False, 0.0))
     trial.ask()
-    assert trial.decide(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0) == RollbackRequest(4)
-    assert trial.state is TrialState.GOING_BACK
-    trial.take(RollbackReply({"state": -3}, 4, 1, "snapshot", 0.5, False))
+    assert trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0) == RollbackRequest(4)
+    assert trial.state is TrialState.ROLLING_BACK
+    trial.on_reply(RollbackReply({"state": -3}, 4, 1, "snapshot", 0.5, False))
     assert trial.state is TrialState.WAITING
     assert trial.observation == {"state": -3}
     trial.ask()
-    trial.decide(np.zeros((1, 2)), seconds=0.0)
-    trial.take(StepResult({}, True, 0.0))
+    trial.on_actions(np.zeros((1, 2)), seconds=0.0)
+    trial.on_reply(StepResult({}, True, 0.0))
     (told,) = row(trial).interventions
     assert (told["step"], told["distance"], told["undone"], trial.steps) == (1, 4, 1, 2)
 
 
 def test_going_back_to_where_the_task_is_solved():
     trial = asked()
-    trial.decide(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0)
-    trial.take(RollbackReply({}, 4, 0, "snapshot", 0.5, True))
+    trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0)
+    trial.on_reply(RollbackReply({}, 4, 0, "snapshot", 0.5, True))
     assert (trial.outcome, trial.reason) == (Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
 
 
@@ -185,8 +185,8 @@ STATES = {
     TrialState.WAITING: handed_off,
     TrialState.ASKED: asked,
     TrialState.ACTING: acting,
-    TrialState.GOING_BACK: lambda: (
-        t := asked(), t.decide(np.zeros((1, 2)), [ControlColumns(rollback=1)], seconds=0)
+    TrialState.ROLLING_BACK: lambda: (
+        t := asked(), t.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=1)], seconds=0)
     )[0],
     TrialState.OVER: lambda: (t := new(), t.skip())[0],
 }  # fmt: skip
@@ -194,18 +194,18 @@ EVENTS = {
     "begin": (lambda t: t.begin(), {TrialState.NEW}),
     "skip": (lambda t: t.skip(), {TrialState.NEW}),
     "ask": (lambda t: t.ask(), {TrialState.WAITING}),
-    "decide": (lambda t: t.decide(np.zeros((1, 2)), seconds=0.0), {TrialState.ASKED}),
-    "refused": (lambda t: t.refused("x", seconds=0.0), {TrialState.ASKED}),
-    "start": (lambda t: t.take(EpisodeStart({}, HANDOFF)), {TrialState.HANDING_OFF}),
-    "stepped": (lambda t: t.take(StepResult({}, False, 0.0)), {TrialState.ACTING}),
-    "acted": (lambda t: t.take(ActResult({}, 1, False, False, 0.0)), {TrialState.ACTING}),
+    "decide": (lambda t: t.on_actions(np.zeros((1, 2)), seconds=0.0), {TrialState.ASKED}),
+    "refused": (lambda t: t.on_policy_error("x", seconds=0.0), {TrialState.ASKED}),
+    "start": (lambda t: t.on_reply(EpisodeStart({}, HANDOFF)), {TrialState.HANDING_OFF}),
+    "stepped": (lambda t: t.on_reply(StepResult({}, False, 0.0)), {TrialState.ACTING}),
+    "acted": (lambda t: t.on_reply(ActResult({}, 1, False, False, 0.0)), {TrialState.ACTING}),
     "went back": (
-        lambda t: t.take(RollbackReply({}, 1, 0, "replay", 0.0, False)),
-        {TrialState.GOING_BACK},
+        lambda t: t.on_reply(RollbackReply({}, 1, 0, "replay", 0.0, False)),
+        {TrialState.ROLLING_BACK},
     ),
     "broke": (
-        lambda t: t.take(SlotFailure("died", "x")),
-        {TrialState.HANDING_OFF, TrialState.ACTING, TrialState.GOING_BACK},
+        lambda t: t.on_reply(SlotFailure("died", "x")),
+        {TrialState.HANDING_OFF, TrialState.ACTING, TrialState.ROLLING_BACK},
     ),
     "fail": (lambda t: t.fail(Outcome.SIM_ERROR, "x"), set(TrialState) - {TrialState.OVER}),
 }
@@ -260,10 +260,10 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
             break
         if kind == "back":
             trial.ask()
-            trial.decide(np.zeros((1, 2)), [ControlColumns(rollback=what)], seconds=0.0)
+            trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=what)], seconds=0.0)
             back = min(what, simulated - undone)
             undone += back
-            trial.take(RollbackReply({}, what, back, "replay", 0.1, False))
+            trial.on_reply(RollbackReply({}, what, back, "replay", 0.1, False))
             continue
         codes = {"plain": np.zeros(2), "solves": np.ones(2), "bad": BAD}
         chunk = np.stack([codes[code] for code in what])
@@ -276,7 +276,7 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
                 break
             trial.ask()
             part = chunk if whole_chunks else chunk[first : first + 1]
-            move = trial.decide(part, said[first : first + len(part)], seconds=0.1)
+            move = trial.on_actions(part, said[first : first + len(part)], seconds=0.1)
             if move is None:
                 break
             steps, solved = 0, False
@@ -285,7 +285,7 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
                 if solved or simulated >= HORIZON + undone:
                     break
             over = solved or simulated >= HORIZON + undone
-            trial.take(
+            trial.on_reply(
                 ActResult({}, steps, solved, over, 0.1) if whole_chunks else StepResult({}, solved, 0.1)
             )
     return trial

@@ -120,10 +120,10 @@ class ForkTrial(Trial):
         )
         return host.lead(self.seed, self._fork.step, stream)
 
-    def decide(
+    def on_actions(
         self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
     ) -> Act | RollbackRequest | None:
-        """As `Trial.decide`; before the fork the logged actions take the place of the policy's, which must be
+        """As `Trial.on_actions`; before the fork the logged actions take the place of the policy's, which must be
         the same."""
         fork = self._fork
         if fork.arm.teacher_forced and self.steps < fork.step:
@@ -131,12 +131,12 @@ class ForkTrial(Trial):
             own = actions[: len(logged)]
             # `not`: also where one is no number
             if own.shape != logged.shape or not np.abs(own - logged).max() <= SAME_ACTION:
-                self.refused(_other_actions(fork, self.steps, own, logged), seconds=seconds)
+                self.on_policy_error(_other_actions(fork, self.steps, own, logged), seconds=seconds)
                 return None
             # What is left of a chunk beyond the fork's step was in the policy's queue then.
             rest = actions[len(logged) :]
             actions = np.concatenate([logged, rest]) if len(rest) else logged
-        return super().decide(actions, directives, seconds=seconds)
+        return super().on_actions(actions, directives, seconds=seconds)
 
 
 def _other_actions(fork: Fork, step: int, own: np.ndarray, logged: np.ndarray) -> str:
