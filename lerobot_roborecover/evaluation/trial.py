@@ -6,8 +6,8 @@
 1. `begin` returns what a simulator needs to rebuild the start. The simulator replays, compares and observes.
 2. `ask` returns the observation for the policy. After an unfaithful handoff the trial ends before this step,
    so the policy sees nothing of it.
-3. `on_actions` takes the policy's actions, or its request for a rollback. It rejects a bad action, which is never
-   sent.
+3. `on_actions` takes the policy's actions, or its request for a rollback. It rejects a bad action, which is
+   never sent.
 4. `on_reply` takes the simulator's reply. It counts steps and hashes actions; the task's predicate decides
    success.
 5. `OVER` has an outcome: success, horizon reached, or the reason why the trial is invalid. `row` returns it.
@@ -15,7 +15,8 @@
 `skip` and `fail` end a trial in any state. The state machine has no clock, process or file. Two loops drive
 it: `evaluation.vector_env` (LeRobot's loop) one action at a time, and `evaluation.scheduler` chunk by chunk.
 The same policy gives the same row in both, because a chunk counts as its single actions. In real-time
-evaluation (`real_time`), `on_actions` puts the actions executed during the inference before the policy's actions.
+evaluation (`real_time`), `on_actions` puts the actions executed during the inference before the policy's
+actions.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_a_bad_action_is_not_sent():
     assert trial.outcome is Outcome.POLICY_ERROR
     assert "non-finite" in trial.reason
     later = asked()
-    move = later.decide(np.stack([np.zeros(2), BAD]), seconds=0.1)
+    move = later.on_actions(np.stack([np.zeros(2), BAD]), seconds=0.1)
     assert len(move.actions) == 1
     later.on_reply(ActResult({}, 1, False, False, 0.0))
     assert later.outcome is Outcome.POLICY_ERROR
