@@ -130,7 +130,7 @@ def test_a_bad_action_is_not_sent():
     assert later.outcome is Outcome.POLICY_ERROR
     assert later.steps == 1
     wide = asked()
-    assert wide.decide(np.zeros((1, 3)), seconds=0.1) is None
+    assert wide.on_actions(np.zeros((1, 3)), seconds=0.1) is None
     assert "(3,)" in wide.reason
 
 

@@ -123,7 +123,7 @@ class ForkTrial(Trial):
     def on_actions(
         self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
     ) -> Act | RollbackRequest | None:
-        """As `Trial.on_actions`. Before the fork the logged actions replace the policy's, which must be the same."""
+        """As `Trial.on_actions`. Before the fork the logged actions replace the policy's equal ones."""
         fork = self._fork
         if fork.arm.teacher_forced and self.steps < fork.step:
             logged = fork.parent.actions[self.steps : self.steps + len(actions)]
