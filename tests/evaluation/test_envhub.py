@@ -75,6 +75,14 @@ def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
     assert "org/name" in capsys.readouterr().err
 
 
+def test_env_files_of_earlier_versions_find_their_import():
+    from lerobot_roborecover.env import envhub as before
+    from lerobot_roborecover.evaluation import envhub
+
+    assert before.make_hub_env is envhub.make_hub_env
+    assert before.HubScenarios is envhub.HubScenarios
+
+
 @pytest.mark.lerobot
 def test_fields_that_are_no_options_are_refused(tmp_path):
     from dataclasses import make_dataclass

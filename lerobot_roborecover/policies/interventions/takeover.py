@@ -44,7 +44,10 @@ class Driver(Protocol):
         """The slot is no longer the driver's: handed back, or its trial is over."""
 
 
-_MOVED = {"lerobot_roborecover.build.teleop.takeover": "lerobot_roborecover.web.teleop.takeover"}
+_MOVED = dict.fromkeys(
+    ("lerobot_roborecover.build.teleop.takeover", "lerobot_roborecover.studio.teleop.takeover"),
+    "lerobot_roborecover.web.teleop.takeover",
+)
 """Drivers under the names that they once had, which saved configurations may hold."""
 
 
