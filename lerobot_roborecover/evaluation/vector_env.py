@@ -9,8 +9,8 @@ Its life under LeRobot's rollout loop:
    log at once, and its slot then repeats its last observation until the batch is over.
 3. LeRobot reads `is_success` from `info`; it is True only on the task's own predicate.
 
-A handoff that is not faithful ends its trial before the policy acts: LeRobot still asks the policy for one
-action on a blank observation, because its loop has no way not to; the action is dropped.
+A handoff that is not faithful ends its trial before the policy acts. LeRobot's loop still asks the policy for
+an action on the observation there, and the action is dropped. A trial without a simulator shows zeros.
 """
 
 from __future__ import annotations
