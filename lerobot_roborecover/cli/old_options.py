@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 
 def renamed(parser: argparse._ActionsContainer, new: str, *old: str) -> None:
@@ -27,7 +27,8 @@ class OldName(argparse.Action):
         assert not option.required, f"{new}: argparse would ask for it beside {old}"
         super().__init__(
             old, option.dest, nargs=option.nargs, const=option.const, default=argparse.SUPPRESS,
-            type=option.type, choices=option.choices, metavar=option.metavar, help=argparse.SUPPRESS,
+            type=cast(Any, option.type), choices=option.choices, metavar=option.metavar,
+            help=argparse.SUPPRESS,
         )  # fmt: skip
         self.new = new
         self._option = option

@@ -50,7 +50,8 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         if label not in names or scenario_id not in scenarios or outcome not in list(Outcome):
             raise ScenarioError(
                 f"{study.outcomes}: {label} {scenario_id} {outcome} is no outcome of this study's arms and "
-                "scenarios; it was stored by another version of it. Run the study without --use-stored-outcomes"
+                "scenarios; it was stored by another version of it. Run the study without "
+                "--use-stored-outcomes"
             )
         arm = names[label]
         row = make_row(

@@ -373,7 +373,7 @@ def test_the_command(policies, logs, tmp_path, capsys):
     other = refused("--rename_map", '{"observation.image": "observation.images.top"}')
     assert "other settings of the policy than here (there / here: rename_map null / " in other
     assert "option handoff_check True" in refused("--env", "handoff_check=false")
-    assert "--at=x" in refused("--at", "x")
+    assert "--steps=x" in refused("--steps", "x")
     assert "no trial is left" in refused("--of", "successes" if not any(
         t.row.success for t in trials.values()) else "failures")  # fmt: skip
 
