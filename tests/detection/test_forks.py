@@ -172,7 +172,7 @@ def test_which_trials_and_which_steps():
     assert Choice(every=25).steps(trial) == [0, 25, 50]
     assert Choice(every=30).steps(trial) == [0, 30]  # at 60 it was over
     assert Choice(at=(59, 60, 5, 5)).steps(trial) == [5, 59]
-    with pytest.raises(ScenarioError, match="every 0"):
+    with pytest.raises(ScenarioError, match="stride 0"):
         Choice(every=0)
 
 
