@@ -35,8 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--out", required=True, type=Path, help="folder of the dataset; new or empty")
     add("--work", type=Path, help="folder of the donors' trials, kept between runs (OUT.trials)")
-    add("--max-base-rate", type=float, default=0.4, help="the base's rate on a scenario (%(default)s)")
-    add("--min-donor-rate", type=float, default=0.6, help="an alternative's rate on it (%(default)s)")
+    add(
+        "--max-base-rate",
+        type=float,
+        default=0.4,
+        help="the base recovers a scenario less often (%(default)s)",
+    )
+    add(
+        "--min-donor-rate",
+        type=float,
+        default=0.6,
+        help="an alternative recovers it more often (%(default)s)",
+    )
     add("--trials", type=int, default=4, help="of each candidate (%(default)s)")
     add(
         "--deterministic", action="append", default=[], metavar="CHECKPOINT",
