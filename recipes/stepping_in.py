@@ -155,7 +155,7 @@ class SteppingIn:
         out = self.out / "forks"
         roborecover(
             "detect", "fork", *logs, "--policy", self.subject.base, "--deterministic",
-            "--arm", f"correction:{correction}", "--every", str(self.subject.fork_every),
+            "--arm", f"correction:{correction}", "--stride", str(self.subject.fork_every),
             "--env", self._snapshots(), "--out", out,
         )  # fmt: skip
         return out
@@ -170,7 +170,7 @@ class SteppingIn:
             "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",
             "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA), "--films", "0",
-            "--workers", "2", "--work", self._watched, "--out", out,
+            "--num-workers", "2", "--work", self._watched, "--out", out,
         )  # fmt: skip
         return out / "detectors"
 

@@ -62,7 +62,7 @@ def analyse(study: Study, options: Options | None = None) -> Results:
         if why is ComparisonVerdict.COUNTS_DEPEND
     ]
     if options.common and not (panel.trials > 0).all(0).any():
-        raise RowsError("--common: no scenario was run by all policies")
+        raise RowsError("--shared-scenarios-only: no scenario was run by all policies")
     return Results(
         study,
         options,

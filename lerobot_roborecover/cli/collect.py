@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.collect.options import CollectOptions
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
 from lerobot_roborecover.datasets.licenses import license_argument
 
@@ -60,12 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--frames", default="256", metavar="none|SIZE", help="side of the pictures, pixels (%(default)s)")
     add(
-        "--film-every", type=int, default=1, metavar="N",
+        "--frame-stride", type=int, default=1, metavar="N",
         help="render every Nth step alone, where that is slow; it stands until the next (%(default)s)",
     )  # fmt: skip
     add("--no-exclude", action="append", default=[], metavar="RULE", help="do not ask this exclusion rule")
     add("--exclude-only", action="append", default=[], metavar="RULE", help="ask this exclusion rule alone")
-    add("--slots", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
+    add("--num-workers", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
     add_workplace(parser, policies=True)
     add("--max-batch", type=int, default=1, help="slots that a policy is asked for at once (%(default)s)")
     add("--device", help="of the policy")
@@ -86,6 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="licence by the Hub's identifier, of the dataset; none is assumed",
     )
     add("--dry-run", action="store_true", help="list the rollouts, and run none")
+    renamed(parser, "--frame-stride", "--film-every")
+    renamed(parser, "--num-workers", "--slots")
 
 
 def pass_through(argv: Sequence[str]) -> int:
@@ -179,11 +182,11 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         seed=args.seed,
         frames=side,
         workplace=workplace(args),
-        slots=args.slots,
+        slots=args.num_workers,
         replicas=args.replicas,
         max_batch=args.max_batch,
         horizon=args.horizon,
-        film_every=args.film_every,
+        film_every=args.frame_stride,
         part_size=args.part_size,
         watchdog_s=args.watchdog,
         retry_errors=args.retry_errors,

@@ -7,6 +7,8 @@ import shlex
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = (
     "Compare failure detectors side by side on a policy's own trials: who needs help, delays, false alarms a "
     "minute, calibration, conformal thresholds, cost. With intervals over scenarios."
@@ -17,7 +19,8 @@ NEEDED = ("detector", "scenarios", "policy")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    add_detector_arguments(parser)
+    add_detector_arguments(parser, workers="--num-workers")
+    renamed(parser, "--num-workers", "--workers")
     add = parser.add_argument
     add("--out", type=Path, default=Path("outputs/detectors"), help="folder of the report (%(default)s)")
     add("--device", help="where the policy and the detectors run")
@@ -30,8 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
 
 
-def add_detector_arguments(parser: argparse._ActionsContainer) -> None:
-    """Adds the arguments that concern detectors and trials alone."""
+def add_detector_arguments(parser: argparse._ActionsContainer, *, workers: str) -> None:
+    """Adds the arguments that concern detectors and trials alone.
+
+    Args:
+        parser: of the command.
+        workers: the option that says how many processes replay and render.
+    """
     add = parser.add_argument
     add(
         "--detector", action="append", metavar="[NAME=]WHAT[,OPTION=VALUE...]",
@@ -73,7 +81,7 @@ def add_detector_arguments(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     add("--films", type=int, default=3, help="trials shown as film strips; 0 renders none (%(default)s)")
     add("--work", type=Path, help="folder of trials and observations, kept between runs (OUT.work)")
-    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add(workers, dest="workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add(
         "--env", action="append", default=[], metavar="NAME=VALUE",
         help="option of the recovery env type, e.g. obs_type=state; may be given again",

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
@@ -34,8 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--out", required=True, type=Path, help="folder of the dataset; new or empty")
     add("--work", type=Path, help="folder of the donors' trials, kept between runs (OUT.trials)")
-    add("--base-below", type=float, default=0.4, help="the base's rate on a scenario (%(default)s)")
-    add("--donor-above", type=float, default=0.6, help="an alternative's rate on it (%(default)s)")
+    add(
+        "--max-base-rate",
+        type=float,
+        default=0.4,
+        help="the base recovers a scenario less often (%(default)s)",
+    )
+    add(
+        "--min-donor-rate",
+        type=float,
+        default=0.6,
+        help="an alternative recovers it more often (%(default)s)",
+    )
     add("--trials", type=int, default=4, help="of each candidate (%(default)s)")
     add(
         "--deterministic", action="append", default=[], metavar="CHECKPOINT",
@@ -46,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--per-record", type=int, default=1, help="trajectories per source record (%(default)s)")
     add("--run-seed", type=int, default=2000, help="of the donors' trials (%(default)s)")
     add("--device", help="of the donors")
-    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add("--num-workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add(
         "--statistics-of", metavar="CHECKPOINT",
         help="normalise as this checkpoint does, whose training goes on here (default: the base, where "
@@ -61,6 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--env", action="append", default=[], metavar="NAME=VALUE",
         help="option of the recovery env type, e.g. obs_type=state; may be given again",
     )  # fmt: skip
+    renamed(parser, "--max-base-rate", "--base-below")
+    renamed(parser, "--min-donor-rate", "--donor-above")
+    renamed(parser, "--num-workers", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
             f"--trials-from; these are {', '.join(sorted(given)) or 'none'}"
         )
     options = donors.DonorOptions(
-        args.base_below, args.donor_above, args.trials, args.successes, args.per_record,
+        args.max_base_rate, args.min_donor_rate, args.trials, args.successes, args.per_record,
         tuple(alike),
     )  # fmt: skip
     scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
@@ -129,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
         atomic_write(folder / FOLDER / MANIFEST_FILE, json.dumps(note, indent=1) + "\n")
 
     donors.write_donors(
-        args.out, chosen, simulator=spec.slot.options, workers=args.workers, funnel=funnel,
+        args.out, chosen, simulator=spec.slot.options, workers=args.num_workers, funnel=funnel,
         description=f"Recoveries by other policies where {base} fails, for Correction.", license=args.license,
         on_trajectory=Progress("replay"), also=finish,
     )  # fmt: skip

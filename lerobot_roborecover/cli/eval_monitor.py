@@ -29,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--draws", type=int, default=10_000, help="without effect: the intervals need no draws")
     add("--seed", type=int, default=0, help="without effect, likewise")
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
-    detect_evaluate.add_detector_arguments(parser.add_argument_group("detectors side by side"))
+    side_by_side = parser.add_argument_group("detectors side by side")
+    # Here --num-workers are those that read frames.
+    detect_evaluate.add_detector_arguments(side_by_side, workers="--workers")
 
 
 def run(args: argparse.Namespace) -> int:

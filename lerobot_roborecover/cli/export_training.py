@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.datasets.licenses import license_argument
 
 HELP = (
@@ -24,8 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--revision", help="commit, tag or branch of that set on the Hub")
     add("--split", default="train", help="take this split of it only (%(default)s)")
     add("--out", required=True, type=Path, help="folder of the dataset; new or empty")
-    add("--of", default="all", choices=("all", "successes", "failures"), help="which trials (%(default)s)")
-    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add(
+        "--outcome",
+        default="all",
+        choices=("all", "successes", "failures"),
+        help="which trials (%(default)s)",
+    )
+    add("--num-workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add(
         "--statistics-of", metavar="CHECKPOINT",
         help="normalise as this checkpoint does, whose training goes on here",
@@ -35,6 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--env", action="append", default=[], metavar="NAME=VALUE",
         help="option of the recovery env type, e.g. obs_type=state; may be given again",
     )  # fmt: skip
+    renamed(parser, "--outcome", "--of")
+    renamed(parser, "--num-workers", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         if source.is_dir():
             lines += lines_of_dataset(read_trajectories(source), by_id, dropped)
         else:
-            lines += lines_of_log(source, by_id, dropped, args.of)
+            lines += lines_of_log(source, by_id, dropped, args.outcome)
     lines = without_test(lines, dropped)
     spec = env_config(scenarios.platform, args.scenarios, [f"--{o}" for o in args.env]).run_spec()
 
@@ -74,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             use_statistics_of(folder, Path(args.statistics_of))
 
     made = export_training(
-        args.out, lines, simulator=spec.slot.options, workers=args.workers, dropped=dropped,
+        args.out, lines, simulator=spec.slot.options, workers=args.num_workers, dropped=dropped,
         description=f"Trials by {', '.join(policies_of(lines))}, for training.", license=args.license,
         on_episode=Progress("episode"), also=finish,
     )  # fmt: skip

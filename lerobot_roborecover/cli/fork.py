@@ -8,6 +8,8 @@ import shlex
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = (
     "Continue logged trials from some of their steps in several ways, and say what each gains over going on: "
     "recovery gain = P(success | intervene) - P(success | continue)."
@@ -25,9 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what to do at a fork, beside going on: fresh, rollback:K, correction:CHECKPOINT, "
         "policy:CHECKPOINT, human:MODULE:FUNCTION; may be given again (fresh and rollback:30)",
     )  # fmt: skip
-    add("--every", type=int, default=25, help="fork every so many steps, from the handoff on (%(default)s)")
-    add("--at", metavar="STEPS", default="", help="fork at these steps instead, e.g. 0,40,80")
-    add("--of", default="all", choices=("all", "failures", "successes"), help="which trials (%(default)s)")
+    add("--stride", type=int, default=25, help="fork every so many steps, from the handoff on (%(default)s)")
+    add("--steps", metavar="STEPS", default="", help="fork at these steps instead, e.g. 0,40,80")
+    add(
+        "--outcome",
+        default="all",
+        choices=("all", "failures", "successes"),
+        help="which trials (%(default)s)",
+    )
     add("--trials", type=int, default=0, help="trials of each scenario, at most (all)")
     add(
         "--repeats",
@@ -56,11 +63,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the env's observation keys to the policy's, JSON, as it was run",
     )  # fmt: skip
     add("--device", help="of the policies")
-    add("--slots", type=int, default=0, help="simulators at once (as roborecover eval)")
+    add("--num-workers", type=int, default=0, help="simulators at once (as roborecover eval)")
     add(
         "--max-batch", type=int, default=1,
         help="observations per inference; above 1 a policy's last bits depend on its company (%(default)s)",
     )  # fmt: skip
+    renamed(parser, "--outcome", "--of")
+    renamed(parser, "--steps", "--at")
+    renamed(parser, "--stride", "--every")
+    renamed(parser, "--num-workers", "--slots")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,9 +86,9 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.utils.progress import Progress
 
     try:
-        at = tuple(int(step) for step in args.at.split(",") if step.strip())
+        at = tuple(int(step) for step in args.steps.split(",") if step.strip())
     except ValueError:
-        raise OptionError(f"--at={args.at}: steps, e.g. 0,40,80") from None
+        raise OptionError(f"--steps={args.steps}: steps, e.g. 0,40,80") from None
     if not isinstance(args.rename_map, dict):
         raise OptionError(f"--rename_map={args.rename_map!r:.80}: a JSON object of observation keys")
     request = ForkRequest(
@@ -85,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         args.policy,
         args.out,
         [parse_arm(text) for text in dict.fromkeys(args.arm or ("fresh", "rollback:30"))],
-        Choice(args.of, args.trials, args.every, at),
+        Choice(args.outcome, args.trials, args.stride, at),
         args.repeats,
         args.scenarios,
         args.revision,
@@ -94,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         args.rename_map,
         correction_steps=args.correction_steps,
         device=args.device,
-        slots=args.slots,
+        slots=args.num_workers,
         max_batch=args.max_batch,
         deterministic=args.deterministic,
     )

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = "join the trial logs of shards; refuses logs of different protocols"
 
 
@@ -15,8 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, help="the merged log")
     parser.add_argument("--force", action="store_true", help="replace a file that exists at --out")
     parser.add_argument(
-        "--unequal", action="store_true", help="accept scenarios with fewer trials than others"
+        "--allow-unequal-trials", action="store_true", help="accept scenarios with fewer trials than others"
     )
+    renamed(parser, "--allow-unequal-trials", "--unequal")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -24,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.logs.merge import merge
     from lerobot_roborecover.utils.text import pluralize
 
-    merged = merge(args.logs, args.out, unequal=args.unequal, force=args.force)
+    merged = merge(args.logs, args.out, unequal=args.allow_unequal_trials, force=args.force)
     scenarios = len({r.scenario_id for r in merged.rows})
     for remark in merged.remarks:
         print(f"note: {remark}", file=sys.stderr)

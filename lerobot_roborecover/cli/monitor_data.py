@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.datasets.licenses import license_argument
 
 HELP = (
@@ -43,11 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--train-frames", type=int, help="frames of the training part (all that balance allows)")
     add("--balanced-frames", type=int, help="frames of the balanced validation (all that balance allows)")
     add("--natural-frames", type=int, help="frames of the natural validation (every one)")
-    add("--every", type=int, default=1, metavar="N", help="choose among every N-th step only (%(default)s)")
+    add("--stride", type=int, default=1, metavar="N", help="choose among every N-th step only (%(default)s)")
     add("--seed", type=int, default=0, help="of the split and the choice of frames (%(default)s)")
     add("--run-seed", type=int, default=1000, help="of the policies' trials (%(default)s)")
     add("--device", help="of the policies")
-    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add("--num-workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add(
         "--license",
         type=license_argument,
@@ -61,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames", action="append", default=[], metavar="NAME=VALUE",
         help="the same for the rendered frames alone, where they differ from what the policies see",
     )  # fmt: skip
+    renamed(parser, "--stride", "--every")
+    renamed(parser, "--num-workers", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -79,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         train_frames=args.train_frames,
         balanced_frames=args.balanced_frames,
         natural_frames=args.natural_frames,
-        every=args.every,
+        every=args.stride,
         seed=args.seed,
     )
     request = MonitorRequest(
@@ -97,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         choice=choice,
         run_seed=args.run_seed,
         device=args.device,
-        workers=args.workers,
+        workers=args.num_workers,
         license=args.license,
     )
     made = make_monitor_data(request, Progress("frame").of)

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_roborecover.cli.old_options import renamed
+
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.render import RenderRequest
 
@@ -22,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--env", action="append", default=[], metavar="KEY=VALUE",
         help="option of the recovery env type, e.g. render_quality=fast; may be given again",
     )  # fmt: skip
-    add("--workers", type=int, default=1, help="processes that replay and render (%(default)s)")
+    add("--num-workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add("--work", type=Path, metavar="DIR", help="finished parts, kept between runs (OUT.parts)")
+    renamed(parser, "--num-workers", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,4 +43,4 @@ def request(args: argparse.Namespace) -> RenderRequest:
     """What to render, from parsed arguments."""
     from lerobot_roborecover.curation.render import RenderRequest
 
-    return RenderRequest(args.dataset, args.out, args.frames, args.env, args.workers, args.work)
+    return RenderRequest(args.dataset, args.out, args.frames, args.env, args.num_workers, args.work)

@@ -7,6 +7,8 @@ import shlex
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = (
     "Turn trial logs into a report: tables with intervals, figures and a scenario gallery in one "
     "HTML file that "
@@ -26,7 +28,7 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--platform", help="take this platform's rows only")
     add(
-        "--common",
+        "--shared-scenarios-only",
         action="store_true",
         help="rank all policies on the scenarios that all were run on (default: those that were run on all)",
     )
@@ -42,6 +44,7 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
         help="treat this policy as an intervention although no trial of it shows one; may be given again",
     )
     add_draws_arguments(parser)
+    renamed(parser, "--shared-scenarios-only", "--common")
 
 
 def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +80,7 @@ def analysis_options(args: argparse.Namespace):
         getattr(args, "baseline", None),
         tuple(getattr(args, "intervention", ())),
         ResamplingUnit(args.cluster) if args.cluster else None,
-        getattr(args, "common", False),
+        getattr(args, "shared_scenarios_only", False),
     )
 
 

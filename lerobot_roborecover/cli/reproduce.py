@@ -7,6 +7,8 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = (
     "Reproduce a published score: the initial arm first, held against what is published by its interval, "
     "then the recovery arm, and a report."
@@ -28,13 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "RATE,LOW,HIGH (default: the paper's)")  # fmt: skip
     add("--margin", type=float, default=10.0, metavar="POINTS",
         help="a loss that the initial arm must be able to show (%(default)s)")  # fmt: skip
-    add("--anyway", action="store_true", help="run the recovery arm also where the initial arm is too low")
+    add("--force", action="store_true", help="run the recovery arm also where the initial arm is too low")
     add("--print", action="store_true", help="print commands and expected hours, and run nothing")
     for field in fields(Costs):
         add(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default,
             help="for the expected hours alone (%(default)s)")  # fmt: skip
     add("--set", action="append", default=[], metavar="NAME=VALUE",
         help="option of roborecover eval for both arms, e.g. policy.device=cuda; again")  # fmt: skip
+    renamed(parser, "--force", "--anyway")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         (*chosen, *(f"--{option}" for option in args.set)),
         published_score(args.published) if args.published else checkpoint.initial,
         args.margin / 100,
-        args.anyway,
+        args.force,
         Costs(**{field.name: getattr(args, field.name) for field in fields(Costs)}),
     )
     if args.print:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
 from lerobot_roborecover.utils.determinism import pin_policy_kernels
 
@@ -43,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="invalid trials that a scenario may have; they count as failures (%(default)s)",
     )  # fmt: skip
     add(
-        "--curtail", action="store_true",
+        "--early-stop", action="store_true",
         help="stop trying a scenario once no further trial could change whether it stays (after three, which "
         "validation replays): the same scenarios stay after fewer trials; deterministic policies come first",
     )  # fmt: skip
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--run-seed", type=int, default=1000, help="of the trials (%(default)s)")
     add("--device", help="of the policies")
-    add("--slots", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
+    add("--num-workers", type=int, default=0, help="simulators at once (one per core, or CPU of a cluster)")
     add_workplace(parser, policies=True)
     add(
         "--max-batch", type=int, default=1,
@@ -79,6 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rename-map", action="append", default=[], metavar="[NAME:]JSON",
         help="the env's observation keys to the policy's, as --rename_map of lerobot-eval",
     )  # fmt: skip
+    renamed(parser, "--early-stop", "--curtail")
+    renamed(parser, "--num-workers", "--slots")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,7 +107,7 @@ def request(args: argparse.Namespace) -> ScreenRequest:
         policies=policies,
         out=args.out,
         trials_folder=args.trials_folder,
-        rule=ScreenRule(args.trials, tuple(args.keep), args.max_invalid, args.curtail),
+        rule=ScreenRule(args.trials, tuple(args.keep), args.max_invalid, args.early_stop),
         deterministic=args.deterministic,
         run_seed=args.run_seed,
         env=env,
@@ -112,7 +115,7 @@ def request(args: argparse.Namespace) -> ScreenRequest:
         shard=args.shard,
         retry=[o for o in args.retry.split(",") if o],
         device=args.device,
-        slots=args.slots,
+        slots=args.num_workers,
         max_batch=args.max_batch,
         workplace=workplace(args),
         replicas=args.replicas,

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_roborecover.cli.old_options import renamed
+
 if TYPE_CHECKING:
     from lerobot_roborecover.curation.split import SplitConfig
 
@@ -25,12 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--seed", type=int, default=42, help="of the draw (%(default)s)")
     add(
-        "--apart", metavar="KEYS",
+        "--disjoint-by", metavar="KEYS",
         help="what no two splits may share, of trajectory, record, instruction, start, separated by commas "
         "(trajectory,record; on robotwin also instruction)",
     )  # fmt: skip
     add(
-        "--least", action="append", default=[], metavar="SPLIT:KEY=N",
+        "--min-per-split", action="append", default=[], metavar="SPLIT:KEY=N",
         help="scenarios of each cell, source or suite that a split has at least, e.g. test:cell=12, where "
         "the set has as many; repeat it for several",
     )  # fmt: skip
@@ -42,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--check", action="store_true", help="report leakage of the splits that are there, and change nothing"
     )
     add("--force", action="store_true", help="divide a dataset anew that was divided before")
+    renamed(parser, "--disjoint-by", "--apart")
+    renamed(parser, "--min-per-split", "--least")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     )
 
     if args.check:
-        report = check_splits(args.dataset, parse_apart(args.apart))
+        report = check_splits(args.dataset, parse_apart(args.disjoint_by))
         print(format_report(report))
         return 1 if report.leaks else 0
     report = split_dataset(args.dataset, config(args), out=args.out, dry_run=args.dry_run, force=args.force)
@@ -70,10 +74,10 @@ def config(args: argparse.Namespace) -> SplitConfig:
     """How to divide, from parsed arguments."""
     from lerobot_roborecover.curation.split import SplitConfig, parse_apart, parse_least, parse_sizes
 
-    apart = parse_apart(args.apart)
+    apart = parse_apart(args.disjoint_by)
     named = {"train": args.train, "val": args.val, "test": args.test}
     sizes = parse_sizes({**{k: v for k, v in named.items() if v}, **dict(_pair(o) for o in args.others)})
-    return SplitConfig(sizes, args.seed, apart, parse_least(args.least))
+    return SplitConfig(sizes, args.seed, apart, parse_least(args.min_per_split))
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lerobot_roborecover.cli.old_options import renamed
+
 HELP = (
     "Re-run a study: every policy from recovery points and from initial states, the interventions, the "
     "report, and the comparison with the stored outcomes, trial by trial."
@@ -18,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--name", default="metaworld", help="which study: one that ships with the package (%(default)s)")
     add("--data", type=Path, help="folder of another study")
     add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
-    add("--every", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
+    add("--stride", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
     add("--jobs", type=int, default=0, help="runs of policies at once (0: one per core)")
     add("--slots", type=int, default=0, help="simulators at once in each (0: the cores left for it)")
     add(
@@ -32,10 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--stage", action="append", default=[], metavar="NAME", help="with --make: this stage only; again")
     add("--print", action="store_true", help="print the commands and run nothing")
     add(
-        "--stored", action="store_true",
+        "--use-stored-outcomes", action="store_true",
         help="run nothing: print the tables, and write the report below --out/stored, of the stored outcomes",
     )  # fmt: skip
     add("--no-report", action="store_true", help="stop after the trials and the comparison")
+    renamed(parser, "--stride", "--every")
+    renamed(parser, "--use-stored-outcomes", "--stored")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     )
     from lerobot_roborecover.study.outcomes import outcomes_of, write_outcomes
 
-    if args.every < 1:
-        raise OptionError(f"--every={args.every}: a count from 1")
+    if args.stride < 1:
+        raise OptionError(f"--stride={args.stride}: a count from 1")
     for name in ("jobs", "slots"):
         if getattr(args, name) < 0:
             raise OptionError(f"--{name}={getattr(args, name)}: a count; 0 follows the cores")
@@ -74,12 +78,12 @@ def run(args: argparse.Namespace) -> int:
     study = read_definition(args.out / "data" if args.make else args.data or shipped_study(args.name))
     if args.print:
         todo = list(
-            arms(study, args.out, scenario_ids(study, args.every) if args.every > 1 else (), args.slots)
+            arms(study, args.out, scenario_ids(study, args.stride) if args.stride > 1 else (), args.slots)
         )
         for line in [*(a.run.command_line() for a in todo), report_command(study, todo, args.out)]:
             print(line)
         return 0
-    if args.stored:
+    if args.use_stored_outcomes:
         from lerobot_roborecover.study.stored import summary_tables, write_stored_logs
 
         done = write_stored_logs(study, args.out / "stored")
@@ -88,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"report {write_report(study, done, args.out / 'stored').files.html}")
         return 0
     done = evaluate(
-        study, args.out, args.every, args.slots, args.jobs, say=lambda line: print(line, flush=True)
+        study, args.out, args.stride, args.slots, args.jobs, say=lambda line: print(line, flush=True)
     )
     write_outcomes(args.out / "outcomes.csv", outcomes_of(done))
     compared = compare_with_stored(study, done)

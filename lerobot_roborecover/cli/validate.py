@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
 
 if TYPE_CHECKING:
@@ -51,10 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--accept", action="append", default=[], metavar="ID", help="take a rejection back")
     add("--by", default="a person", metavar="NAME", help="who looked (%(default)s)")
-    add("--workers", type=int, default=0, help="processes that replay (1, or every CPU of a cluster)")
+    add("--num-workers", type=int, default=0, help="processes that replay (1, or every CPU of a cluster)")
     add_workplace(parser, policies=False)
     add("--limit-s", type=float, default=900, help="for one scenario's replays (%(default)s)")
     add("--work", type=Path, metavar="DIR", help="replays and sheets, kept between runs (OUT.replays)")
+    renamed(parser, "--num-workers", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -91,7 +93,7 @@ def request(args: argparse.Namespace) -> ValidationRequest:
         rejects=read_rejects(args.rejects) | dict.fromkeys(args.reject, args.reason),
         accepts=args.accept,
         by=args.by,
-        workers=args.workers,
+        workers=args.num_workers,
         workplace=workplace(args),
         limit_s=args.limit_s,
         work=args.work,
@@ -102,7 +104,7 @@ def _states(args: argparse.Namespace) -> int:
     from lerobot_roborecover.curation.validate.states import write_states
     from lerobot_roborecover.utils.progress import Progress
 
-    found = write_states(args.dataset, args.out, args.workers, Progress("replay"), workplace(args))
+    found = write_states(args.dataset, args.out, args.num_workers, Progress("replay"), workplace(args))
     print(
         f"{found.scenarios} states, each replayed twice and identical; {found.filled} had no hash; largest "
         f"distance from the recording {found.largest_mm:g} mm\n{args.out}"

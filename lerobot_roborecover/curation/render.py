@@ -60,7 +60,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
     check_new(request.out)
     check_size(request.size)
     if request.workers < 1:
-        raise OptionError(f"--workers={request.workers}: at least 1")
+        raise OptionError(f"--num-workers={request.workers}: at least 1")
     scenarios, manifest = read_with_manifest(request.dataset)
     empty = [s.id for s in scenarios if not len(s.prefix)]
     if empty:

@@ -98,7 +98,9 @@ def parse_apart(text: str | None) -> tuple[str, ...] | None:
     keys = tuple(key.strip() for key in text.split(",") if key.strip())
     unknown = [key for key in keys if key not in APART]
     if unknown or not keys:
-        raise ScenarioError(f"--apart {text!r:.80}: {unknown[:1] or 'nothing'} is not of {', '.join(APART)}")
+        raise ScenarioError(
+            f"--disjoint-by {text!r:.80}: {unknown[:1] or 'nothing'} is not of {', '.join(APART)}"
+        )
     return keys
 
 
@@ -113,7 +115,9 @@ def parse_least(given: Iterable[str]) -> dict[str, dict[str, int]]:
         split, _, rest = text.partition(":")
         axis, _, number = rest.partition("=")
         if not number.strip().isdecimal():
-            raise ScenarioError(f"--least {text!r:.60} is not written SPLIT:KEY=NUMBER, e.g. test:cell=12")
+            raise ScenarioError(
+                f"--min-per-split {text!r:.60} is not written SPLIT:KEY=NUMBER, e.g. test:cell=12"
+            )
         least[split.strip()][axis.strip()] = int(number)
     return dict(least)
 

@@ -98,7 +98,7 @@ class RunnerOptions:
     @property
     def workplace(self) -> Backend:
         """Where the run is."""
-        return Backend(self.engine, self.ray_address, "--runner.", device="--policy.device")
+        return Backend(self.engine, self.ray_address, "--runner.", "slots", "--policy.device")
 
     def check(self) -> None:
         """Refuses what cannot be used.

@@ -140,7 +140,7 @@ def merge(logs: Sequence[Path], out: Path, *, unequal: bool = False, force: bool
             raise TrialLogError(
                 f"policy {policy}, start {start}: scenarios differ in their number of trials "
                 f"({listed}). A shard "
-                "is unfinished or missing: run it with its own log, or accept it with --unequal"
+                "is unfinished or missing: run it with its own log, or accept it with --allow-unequal-trials"
                 + "".join(f". {remark}" for remark in remarks)
             )
     remarks += extent_remarks(rows)

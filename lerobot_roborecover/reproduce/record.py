@@ -68,10 +68,10 @@ def verdict(result: ReproductionResult) -> str:
     said = f"Initial states {ours} % here, {theirs} % published: {gap}."
     if check.standing is AgreementVerdict.LOWER:
         end = (
-            "The recovery arm was run all the same (--anyway); do not take it for this policy's."
+            "The recovery arm was run all the same (--force); do not take it for this policy's."
             if result.recovery
             else "The recovery arm was not run: find the cause first (roborecover check policy; "
-            "docs/policies.md), or say --anyway."
+            "docs/policies.md), or say --force."
         )
         return f"**Not reproduced.** {said} The interval leaves zero out. {end}"
     if check.standing is AgreementVerdict.UNDECIDED:

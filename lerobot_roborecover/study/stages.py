@@ -119,7 +119,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
             tuple(trials / name / "eval_info.json" for name in screening),
         )
     ]  # fmt: skip
-    workers = ("--workers", str(default_slots("cpu", usable_cores(), available_gb())))
+    workers = ("--num-workers", str(default_slots("cpu", usable_cores(), available_gb())))
     correction, monitor = out / "correction_training", out / "monitor_training"
     return [
         StudyStage(

@@ -37,7 +37,9 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         ScenarioError: nothing is stored, or an outcome is of no scenario of the study.
     """
     if not study.outcomes.exists():
-        raise ScenarioError(f"{study.root} has no stored outcomes; run the study without --stored")
+        raise ScenarioError(
+            f"{study.root} has no stored outcomes; run the study without --use-stored-outcomes"
+        )
     stored = read_outcomes(study.outcomes)
     dataset = load_scenarios(study.scenarios, split=study.split)
     scenarios = {s.id: s for s in dataset}
@@ -48,7 +50,8 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
         if label not in names or scenario_id not in scenarios or outcome not in list(Outcome):
             raise ScenarioError(
                 f"{study.outcomes}: {label} {scenario_id} {outcome} is no outcome of this study's arms and "
-                "scenarios; it was stored by another version of it. Run the study without --stored"
+                "scenarios; it was stored by another version of it. Run the study without "
+                "--use-stored-outcomes"
             )
         arm = names[label]
         row = make_row(

@@ -44,7 +44,7 @@ class Backend:
     """The cluster's; `auto` finds the one that this machine belongs to."""
     prefix: str = "--"
     """Of its options' names, for messages."""
-    count: str = "slots"
+    count: str = "num_workers"
     """The option that says how many there are."""
     device: str = "--device"
     """The option that says where a policy computes."""

@@ -14,7 +14,7 @@ import pickle
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 from types import TracebackType
 from typing import Any
@@ -139,7 +139,7 @@ class JobPool:
         workplace: Backend = LOCAL,
     ):
         self.platform, self.options = platform, dict(options or {})
-        self._asked, self._fresh, self._workplace = workers, fresh, replace(workplace, count="workers")
+        self._asked, self._fresh, self._workplace = workers, fresh, workplace
         self._settled = 0
         self._pool = SlotPool(
             SlotConfig(platform, self.options, server=SERVER, start_s=0.0 if fresh else None),

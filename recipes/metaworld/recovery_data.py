@@ -4,7 +4,7 @@ are recoveries.
     python -m recipes.metaworld.recovery_data --out outputs/recovery_data
 
 Demonstrations of the study's tasks, clean and shaken; recoveries of the study's policies from the training
-scenarios (`curate training-data --of successes`); mixtures of equal size; the study's `act` on each of
+scenarios (`curate training-data --outcome successes`); mixtures of equal size; the study's `act` on each of
 them with several seeds; every result from the test scenarios' recovery points and initial states. What is
 finished is skipped. At the end, tables with intervals over runs and scenarios
 (`roborecover report METHOD=LOG,LOG,...`) and the curve of the recovery rate against the share of recoveries.
@@ -73,7 +73,7 @@ def make_recoveries(out: Path, pool: dict[str, int]) -> Path:
         ]  # fmt: skip
         roborecover(
             "curate", "training-data", *logs, "--scenarios", SCENARIOS, "--split", "train",
-            "--env", "obs_type=state", "--of", "successes", "--out", root,
+            "--env", "obs_type=state", "--outcome", "successes", "--out", root,
         )  # fmt: skip
     return root
 

@@ -239,7 +239,8 @@ def test_too_many_are_refused_with_the_option(cluster, run, tmp_path, capsys):
     asked = arguments(tmp_path / "out", "--expert=expert", "--seeds=0-9", "--engine=ray", "--slots=9")
     assert run(*asked) == 2
     assert (
-        "9 simulators need 9 CPUs; the Ray cluster has 4. Use --slots=4 or fewer" in capsys.readouterr().err
+        "9 simulators need 9 CPUs; the Ray cluster has 4. Use --num-workers=4 or fewer"
+        in capsys.readouterr().err
     )
 
 

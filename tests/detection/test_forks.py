@@ -172,7 +172,7 @@ def test_which_trials_and_which_steps():
     assert Choice(every=25).steps(trial) == [0, 25, 50]
     assert Choice(every=30).steps(trial) == [0, 30]  # at 60 it was over
     assert Choice(at=(59, 60, 5, 5)).steps(trial) == [5, 59]
-    with pytest.raises(ScenarioError, match="every 0"):
+    with pytest.raises(ScenarioError, match="stride 0"):
         Choice(every=0)
 
 
@@ -373,7 +373,7 @@ def test_the_command(policies, logs, tmp_path, capsys):
     other = refused("--rename_map", '{"observation.image": "observation.images.top"}')
     assert "other settings of the policy than here (there / here: rename_map null / " in other
     assert "option handoff_check True" in refused("--env", "handoff_check=false")
-    assert "--at=x" in refused("--at", "x")
+    assert "--steps=x" in refused("--steps", "x")
     assert "no trial is left" in refused("--of", "successes" if not any(
         t.row.success for t in trials.values()) else "failures")  # fmt: skip
 

@@ -84,7 +84,7 @@ def run_on(
     run.pool.acquire()
     try:
         units = units_of(list(scenarios), TRIALS)
-        there = EngineConfig(Backend("ray", prefix="--runner."), slots, **(places or {}))
+        there = EngineConfig(Backend("ray", prefix="--runner.", count="slots"), slots, **(places or {}))
         engine = open_engine(run, units, make_host, there, on_row=lambda row: on_row(engine))
         engine.run(units)
     finally:

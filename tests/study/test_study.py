@@ -162,7 +162,7 @@ def test_refusals(study, tmp_path, capsys):
         return capsys.readouterr().err
 
     assert "has no study.json" in refused("--data", str(tmp_path))
-    assert "--every=0: a count from 1" in refused("--data", str(study), "--every", "0")
+    assert "--stride=0: a count from 1" in refused("--data", str(study), "--stride", "0")
     assert "--jobs=-1: a count" in refused("--data", str(study), "--jobs", "-1")
     assert "add --make" in refused("--stage", "policies")
     assert "add --make" in refused("--shipped-scenarios")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.cli.main import build_parser, command_parser
+from lerobot_roborecover.cli.old_options import OldName
 from lerobot_roborecover.cli.tree import GROUPS, SPLIT_NAMES, find_call
 
 FILE = Path(__file__).parents[1] / "cli" / "options.json"
@@ -88,6 +89,8 @@ def _of_parser(parser: argparse.ArgumentParser) -> Options:
 
 
 def _of_action(action: argparse.Action) -> dict[str, Any]:
+    if isinstance(action, OldName):
+        return {"old_name_of": action.new}
     said = {
         "positional": not action.option_strings,
         "required": action.required and bool(action.option_strings),

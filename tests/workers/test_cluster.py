@@ -108,7 +108,7 @@ def test_a_cluster_that_cannot_do_the_work_is_refused(cluster, monkeypatch):
     cluster.complete()
     with (
         JobPool("fake", workers=9, workplace=RAY) as pool,
-        pytest.raises(OptionError, match=r"9 simulators need 9 CPUs; .* has 4\. Use --workers=4"),
+        pytest.raises(OptionError, match=r"9 simulators need 9 CPUs; .* has 4\. Use --num-workers=4"),
     ):
         pool.call(work, "a")
     pool = SlotPool(SlotConfig("fake"), workers=True, timeout_s=60)

@@ -103,7 +103,7 @@ def episode_table(measured: Sequence[Measured]) -> Table:
         if not e.every_step:
             notes.append(
                 f"{m.name} leaves out steps: trigger rates are too low and delays too long there. Make every "
-                "step with `roborecover detect data` without --natural-frames and --every."
+                "step with `roborecover detect data` without --natural-frames and --stride."
             )
     return Table("episodes", "Trajectories", columns, tuple(rows), tuple(notes))
 

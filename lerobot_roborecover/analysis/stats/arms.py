@@ -205,7 +205,7 @@ def arm_remarks(arms: Sequence[Arm]) -> list[str]:
         if arm.missing:
             remarks.append(
                 f"{arm.title}: incomplete: {arm.missing.words}; what is missing may be no accident, so it "
-                "has no verdict. Run the rest, or ask for what all were run on with --common"
+                "has no verdict. Run the rest, or ask for what all were run on with --shared-scenarios-only"
             )
         if arm.runs:
             run_on = [{row.scenario_id for row in rows} for _, rows in arm.runs]

@@ -64,7 +64,7 @@ def compared(
         who = "policy" if len(chosen) == 1 else "policies"
         words.append(
             f"{len(chosen)} of {policies} policies are ranked, the {who} run on {on} scenarios; not run on "
-            f"all of them, and so neither ranked nor judged: {left}. --common ranks all on what all were run "
-            "on"
+            f"all of them, and so neither ranked nor judged: {left}. --shared-scenarios-only "
+            "ranks all on what all were run on"
         )
     return Compared(chosen, keep, len(chosen) == policies and len(keep) == scenarios, "; ".join(words))

@@ -103,7 +103,7 @@ def verdict_text(contrast: Contrast) -> str:
             "that its run asked for, and what it lacks may be no accident. "
             f"On the {contrast.scenarios} that both were run on, "
             + (f"{ahead} is ahead by {points}. " if d else "neither is ahead. ")
-            + "Evaluate the rest, or ask for the common scenarios with --common."
+            + "Evaluate the rest, or ask for the common scenarios with --shared-scenarios-only."
         )
     if found is ComparisonVerdict.COUNTS_DEPEND:
         return (

@@ -99,10 +99,10 @@ class CollectOptions:
             ("watchdog_s", 1, 86_400),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
-                option = name.removesuffix("_s").replace("_", "-")
+                option = "num-workers" if name == "slots" else name.removesuffix("_s").replace("_", "-")
                 raise OptionError(f"--{option}={getattr(self, name)}: must be from {low} to {high}")
         if not 1 <= self.film_every <= 1000:
-            raise OptionError(f"--film-every={self.film_every}: 1 to 1000 steps")
+            raise OptionError(f"--frame-stride={self.film_every}: 1 to 1000 steps")
         if self.frames and not 16 <= self.frames <= 2048:
             raise OptionError(f"--frames={self.frames}: none, or a side of 16 to 2048 pixels")
         own = platform_named(self.platform)

@@ -96,7 +96,7 @@ def _why_not(row: TrialRow, scenario: Scenario | None, of: str) -> str:
     if not Outcome(row.outcome).valid or not row.steps:
         return f"outcome {row.outcome}"
     if of != "all" and row.success != (of == "successes"):
-        return f"not among the {of} (--of)"
+        return f"not among the {of} (--outcome)"
     note = note_of(row)
     if note is not None and note.stream != MATCHED:
         return "a fork that only repeats its trial"

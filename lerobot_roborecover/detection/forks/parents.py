@@ -43,11 +43,11 @@ class Choice:
 
     def __post_init__(self):
         if self.of not in OF:
-            raise ScenarioError(f"--of={self.of}: not one of {', '.join(OF)}")
+            raise ScenarioError(f"--outcome={self.of}: not one of {', '.join(OF)}")
         if self.every < 1 or self.trials < 0 or any(step < 0 for step in self.at):
             raise ScenarioError(
-                f"every {self.every}, trials {self.trials}, at {list(self.at)}: steps and counts are not "
-                "negative, and --every is at least 1"
+                f"stride {self.every}, trials {self.trials}, steps {list(self.at)}: steps and counts are not "
+                "negative, and --stride is at least 1"
             )
 
     def steps(self, trial: LoggedTrial) -> list[int]:
@@ -105,7 +105,7 @@ def _why_not(row: TrialRow, choice: Choice) -> str:
     if row.run_seed is None:
         return "ran without a seed"
     if choice.of != "all" and row.success != (choice.of == "successes"):
-        return f"not among the {choice.of} (--of)"
+        return f"not among the {choice.of} (--outcome)"
     return ""
 
 

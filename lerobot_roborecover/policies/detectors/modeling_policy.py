@@ -215,7 +215,7 @@ class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
             raise MonitorError(
                 f"recovery_gain: of {len(gains)} forks the intervention rescued none "
                 f"({self.config.labels['harmed']} harmed), so there is no gain to learn. Fork more trials "
-                "(roborecover detect fork --every), or with another --arm"
+                "(roborecover detect fork --stride), or with another --arm"
             )
         return self._train(features, (1 + gains.float()) / 2, torch.ones(len(gains)))
 
