@@ -114,6 +114,7 @@ def test_many_sign_flips_at_once_are_those_one_by_one(benchmark):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_holm_is_that_of_statsmodels():
     from statsmodels.stats.multitest import multipletests
 

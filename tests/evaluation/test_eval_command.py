@@ -158,7 +158,9 @@ def temporary(tmp_path, monkeypatch):
     return folder
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly)]
+)
 def test_stop_signals_leave_a_log_that_a_rerun_completes(
     run, whole, monkeypatch, capsys, temporary, number, status
 ):

@@ -152,6 +152,7 @@ def test_a_policy_that_blocks_ends_its_trials_and_the_run(dataset, tmp_path):
     assert sum(r.outcome == "policy_error" for r in rows) == asked
 
 
+@pytest.mark.nightly
 def test_a_run_that_is_to_stop_does_not_wait_for_a_policy_that_blocks(dataset, tmp_path):
     host = BlockingHost(good=5)
     engine, rows = run_engine(

@@ -20,8 +20,8 @@ KINDS = {
     "goal:7": "a knob is turned",
     "goal:8": "a bowl is put down beside a cabinet",
 }
-SOME = ("10:9", "goal:5", "goal:7")
-"""Those of the default run."""
+SOME = ("10:9",)
+"""Those of the default run; the nightly run takes all."""
 
 
 def start(number: str, init: int):

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.libero
 
 STEPS = 24
 TASKS = [(suite, index) for suite, names in libero_tasks().items() for index in range(len(names))]
-SOME = [("libero_spatial", 4), ("libero_object", 0), ("libero_goal", 7), ("libero_10", 2)]
+SOME = [("libero_object", 0), ("libero_10", 2)]
 
 
 @pytest.fixture(scope="module")

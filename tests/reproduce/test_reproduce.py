@@ -92,6 +92,7 @@ def test_a_score_that_is_missed_stops_before_the_recovery_arm(reproduce, capsys)
     assert "do not take it" in (out / "reproduction.md").read_text()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_run_that_fails_says_how_to_go_on(reproduce, capfd):
     assert reproduce("--set", "policy.path=/nowhere")[0] == 2
