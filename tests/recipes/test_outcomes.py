@@ -9,6 +9,7 @@ import pytest
 from lerobot_roborecover.analysis.stats.detection import NEEDS_HELP
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
+from recipes.metaworld.recovery_data import STORED as RECOVERY_DATA
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.stepping_in import ARMS, stored_folder
 from tests.support.trial_rows import policy_rows, write_log
@@ -83,3 +84,19 @@ def test_the_page_on_detectors_says_what_is_stored(name):
         for value in (area, alarmed):
             shown = f"{100 * value.value:.1f} [{100 * value.low:.1f}, {100 * value.high:.1f}]"
             assert f"| `{detector.name}` | {shown} |" in page
+
+
+def test_the_page_on_training_on_recoveries_says_what_is_stored():
+    page = (DOCS / "recovery_data.md").read_text(encoding="utf-8")
+    rates: dict[str, list[str]] = {}
+    trials = 0
+    for run, log in stored_logs(RECOVERY_DATA).items():
+        rows = read_trial_log(log)
+        trials += len(rows)
+        success = {r.scenario_id: r.success for r in rows if r.start == "recovery"}
+        assert len(success) == 359
+        rates.setdefault(run.rpartition("_")[0], []).append(rate_of(success))
+    assert f"{trials:,} trials" in page
+    for mixture, of in rates.items():
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{mixture}` | ") and "[" in line)
+        assert f"| {', '.join(of)} |" in row
