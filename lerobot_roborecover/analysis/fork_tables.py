@@ -21,7 +21,7 @@ def gain_tables(gains: ForkGains) -> list[Table]:
     """All forks, by step, by cell, and by both."""
     arms, steps, cells = gains.arms, gains.steps, gains.cells
     notes = (
-        "Gain: success when somebody steps in, less success when the same policy continues from the same "
+        "Gain: success with the intervention, less success when the same policy continues from the same "
         "step of the same trial. Every scenario counts the same; intervals (95 %) speak of "
         f"{ESTIMAND[gains.unit]}. They are not adjusted for the number of rows: a row that was picked by its "
         "gain is to be tried on other scenarios.",
