@@ -1,4 +1,4 @@
-"""`roborecover curate teleop` on the fake simulator, and somebody who pushes the puck to its goal."""
+"""`roborecover curate teleop` on the fake simulator: a user pushes the puck to its goal."""
 
 from __future__ import annotations
 
