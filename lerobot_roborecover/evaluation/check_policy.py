@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from lerobot.configs import FeatureType, PreTrainedConfig
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.datasets import ScenarioSet
@@ -311,7 +310,6 @@ def main(argv: Sequence[str]) -> int:
     from lerobot_roborecover.policies.command_line import rewrite_env_argument
 
     init_logging()
-    register_third_party_plugins()
     long = [SHORT.get(argument, argument) for argument in argv]
     program, *words = rewrite_env_argument(["roborecover-eval", *long])
     return run_with_arguments(check, program, words)

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_roborecover.errors import OptionError
@@ -24,6 +23,7 @@ from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.policies.runner import PolicyRunner, ProvidesRunner
 from lerobot_roborecover.policies.threads import fit_threads
+from lerobot_roborecover.utils.plugins import register_plugins
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ def policy_config(policy: str, options: Sequence[str] = (), device: str | None =
     from lerobot_roborecover.policies.interventions import configuration_intervention  # noqa: F401 - and ours
     from lerobot_roborecover.policies.remote import configuration_remote  # noqa: F401
 
+    register_plugins()
     check_checkpoint(policy)
     overrides = [f"--{o.removeprefix('--')}" for o in options]
     overrides += [f"--device={device}"] if device else []
@@ -90,7 +91,7 @@ def load_host(spec: HostSpec) -> PolicyRunner:
 
 
 def _load_host(spec: HostSpec) -> PolicyRunner:
-    register_third_party_plugins()
+    register_plugins()
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(spec.seed)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.analysis.summary import format_table, summarise
@@ -343,7 +342,6 @@ def main(argv: Sequence[str]) -> int:
     from lerobot_roborecover.policies.command_line import rewrite_env_argument
 
     init_logging()
-    register_third_party_plugins()
     program, *words = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
     return run_with_arguments(evaluate, program, words)
 

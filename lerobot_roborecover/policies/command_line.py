@@ -11,6 +11,7 @@ from lerobot.configs import parser
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.utils.plugins import register_plugins
 
 
 def rewrite_env_argument(argv: list[str]) -> list[str]:
@@ -44,7 +45,8 @@ def rewrite_env_argument(argv: list[str]) -> list[str]:
 
 
 def run_with_arguments[C](command: Callable[[C], int], program: str, argv: Sequence[str]) -> int:
-    """Runs a command with the configuration that arguments ask for, as LeRobot reads them.
+    """Runs a command with the configuration that arguments ask for, as LeRobot reads them. Types of installed
+    plugins can be named.
 
     Args:
         command: its parameter's annotation is the class of the configuration itself, not its name.
@@ -54,6 +56,7 @@ def run_with_arguments[C](command: Callable[[C], int], program: str, argv: Seque
     Returns:
         What the command returned: an exit code.
     """
+    register_plugins()
     # LeRobot types the wrapped command as the bare one, which cannot be called without a configuration.
     wrapped: Callable[..., int] = parser.wrap()(command)
     with process_arguments(program, argv), plain_parsing():

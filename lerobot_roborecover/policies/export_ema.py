@@ -73,10 +73,11 @@ def _check_optimizer(folder: Path) -> None:
 def _load(model: Path) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies import get_policy_class
-    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_roborecover.utils.plugins import register_plugins
 
     check_folder(model, str(model))
-    register_third_party_plugins()
+    register_plugins()
     config = PreTrainedConfig.from_pretrained(model)
     if config.use_peft:
         raise OptionError(f"{model} is a PEFT adapter; its average cannot be exported. Train without --peft")

@@ -6,8 +6,6 @@ An arm that cannot start is found before the first trial of any, and not when it
 import sys
 from collections.abc import Sequence
 
-from lerobot.utils.import_utils import register_third_party_plugins
-
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.policies.command_line import run_with_arguments
@@ -29,7 +27,6 @@ def main(argv: Sequence[str]) -> int:
     Returns:
         1 where one cannot be loaded; all of them are tried, and said.
     """
-    register_third_party_plugins()
     status = 0
     for path in argv:
         try:

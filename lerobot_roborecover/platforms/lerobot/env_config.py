@@ -10,7 +10,6 @@ import draccus
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, HubEnvConfig, PushtEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup, VideoEnvMixin
@@ -19,6 +18,7 @@ from lerobot_roborecover.platforms.lerobot.known import KNOWN
 from lerobot_roborecover.platforms.lerobot.platform import DEFAULT_TYPE, HUB_TYPE, member_name
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, check_hub
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.utils.plugins import register_plugins
 
 _NOT_SIMULATED = ("gym_manipulator",)
 """Env types that are real robots: nothing of theirs can be replayed."""
@@ -43,6 +43,7 @@ class BaseEnvConfig(draccus.ChoiceRegistry):
     @classmethod
     def get_known_choices(cls) -> dict[str, Any]:
         """By name."""
+        register_plugins()
         every = EnvConfig.get_known_choices()
         ours = {n: c for n, c in every.items() if not n.startswith(ENV_PREFIX) and n not in _NOT_SIMULATED}
         return {HUB_TYPE: EnvHubConfig, **ours}
@@ -61,7 +62,6 @@ class BaseEnvConfig(draccus.ChoiceRegistry):
 
 def base_types() -> Iterable[str]:
     """Names of the env types that can be a base, those of installed plugins among them."""
-    register_third_party_plugins()
     return BaseEnvConfig.get_known_choices()
 
 

@@ -143,8 +143,9 @@ def decode_config(config: Mapping[str, Any]) -> Any:
     """The LeRobot `EnvConfig` of its plain values; imports LeRobot, and its plugins."""
     import draccus
     from lerobot.envs.configs import EnvConfig
-    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_roborecover.utils.plugins import register_plugins
 
     if config["type"] not in EnvConfig.get_known_choices():
-        register_third_party_plugins()
+        register_plugins()
     return draccus.decode(EnvConfig, dict(config))

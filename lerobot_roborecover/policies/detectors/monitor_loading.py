@@ -28,8 +28,10 @@ def load_monitor(
     from lerobot.rewards import get_reward_model_class
 
     from lerobot_roborecover.policies.detectors.monitor import register_monitors
+    from lerobot_roborecover.utils.plugins import register_plugins
 
     register_monitors()
+    register_plugins()
     file = find_file(path, CONFIG_FILE, revision)
     try:
         kind = json.loads(file.read_text()).get("type")

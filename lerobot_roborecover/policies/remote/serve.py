@@ -10,7 +10,6 @@ import torch
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.errors import OptionError
@@ -189,5 +188,4 @@ def main(argv: Sequence[str]) -> int:
     """
     init_logging()
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    register_third_party_plugins()
     return run_with_arguments(serve, "roborecover-serve", argv)
