@@ -1,6 +1,7 @@
-"""Study of when to intervene: a detector learns from forks where Correction gains (docs/stepping_in.md).
+"""Study of when to intervene: a detector learns from forks where Correction gains.
 
 It is compared with never intervening and always intervening on scenarios that nothing was learned from.
+Plan and results: docs/studies/intervention_timing.md.
 
     python -m recipes.stepping_in --platform libero --out outputs/stepping_in
     python -m recipes.stepping_in --platform metaworld --out outputs/stepping_in_metaworld

@@ -30,9 +30,9 @@ MODES = {
 }
 """Interventions by their names on the pages."""
 PAGES = {
-    "metaworld": ("docs/study.md",),
-    "metaworld_recovery": ("README.md", "docs/study.md"),
-    "libero": ("docs/libero_study.md",),
+    "metaworld": ("docs/studies/metaworld.md",),
+    "metaworld_recovery": ("README.md", "docs/studies/metaworld_recovery.md"),
+    "libero": ("docs/studies/libero.md",),
 }
 _RESULTS: dict[str, Results] = {}
 
@@ -105,7 +105,7 @@ def test_one_inversion_is_shown_on_meta_world_and_none_over_tasks(results):
     assert (agreement.inversions.value, agreement.inversions.low, agreement.inversions.high) == (5, 1, 9)
     tasks = pairs_from_both_starts(*found.both_starts_over(ResamplingUnit.TASK))
     assert not [p for p in tasks if p.shown < 0]
-    rows = cells("docs/study.md")
+    rows = cells("docs/studies/metaworld_recovery.md")
     for pair in inverted:
         initial = pair.initial if pair.initial.difference.value > 0 else pair.initial.reversed()
         (row,) = (row for row in rows if row[:2] == [initial.a, initial.b])
@@ -122,7 +122,7 @@ def test_one_disturbed_expert_carries_libero_s_gains(results):
     assert [round(100 * g.outside.difference.value, 1) for g in expert] == [1.0, 9.5, 1.0, 9.5]
     assert [round(g.outside.p_holm, 2) for g in expert] == [1, 0.19, 1, 0.17]
     assert {(g.inside.scenarios, g.outside.scenarios) for g in expert} == {(95, 105)}
-    rows = cells("docs/libero_study.md")
+    rows = cells("docs/studies/libero.md")
     for gain in expert:
         inside, outside = (f"+{shown(c.difference, 'points')}" for c in (gain.inside, gain.outside))
         assert [row for row in rows if row[0] == MODES[gain.inside.a] and inside in row and outside in row]
