@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+
+from lerobot_roborecover.utils.options import option
 
 HELP = "Write an EnvHub repository (env.py and a card) that offers a scenario set as an environment."
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add = parser.add_argument
-    add("scenarios", help="scenario set: Hub id (org/name), or the name of a shipped one")
-    add("--revision", help="commit, tag or branch of the set; the commit that is read is what env.py names")
-    add("--split", help="this split only, e.g. test")
-    add("--repo-id", required=True, metavar="ORG/NAME", help="what the environment will be called on the Hub")
-    add("--out", type=Path, required=True, help="folder of the repository's files")
+@dataclass(frozen=True, kw_only=True)
+class EnvHubOptions:
+    """Which scenarios to offer, and under which name."""
+
+    scenarios: str = option(positional=True)
+    """Scenario set: Hub id (org/name), or the name of a shipped one."""
+    revision: str | None = None
+    """Commit, tag or branch of the set; the commit that is read is what env.py names."""
+    split: str | None = None
+    """This split only, e.g. test."""
+    repo_id: str = option(metavar="ORG/NAME")
+    """What the environment will be called on the Hub."""
+    out: Path
+    """Folder of the repository's files."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = EnvHubOptions
+
+
+def run(options: EnvHubOptions) -> int:
     """Writes the files and says how to upload them."""
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.evaluation.envhub_files import write_envhub
 
-    found = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
-    for path in write_envhub(found, args.out, args.repo_id, args.split):
+    found = load_scenarios(options.scenarios, revision=options.revision, split=options.split)
+    for path in write_envhub(found, options.out, options.repo_id, options.split):
         print(f"wrote     {path}")
-    print(f"offer it  hf upload {args.repo_id} {args.out}")
-    print(f'use it    make_env(HubEnvConfig(hub_path="{args.repo_id}"), trust_remote_code=True)')
+    print(f"offer it  hf upload {options.repo_id} {options.out}")
+    print(f'use it    make_env(HubEnvConfig(hub_path="{options.repo_id}"), trust_remote_code=True)')
     return 0

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+
+from lerobot_roborecover.utils.options import option
 
 HELP = "write a plain checkpoint with the averaged weights of a lerobot-train run"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds this command's arguments."""
-    parser.add_argument("checkpoint", type=Path, help="checkpoints/<step> (or checkpoints/last) of the run")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write; new or empty")
+@dataclass(frozen=True, kw_only=True)
+class ExportEmaOptions:
+    """Which checkpoint to read, and where to write."""
+
+    checkpoint: Path = option(positional=True)
+    """checkpoints/<step> (or checkpoints/last) of the run."""
+    out: Path
+    """Folder to write; new or empty."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = ExportEmaOptions
+
+
+def run(options: ExportEmaOptions) -> int:
     """Writes the checkpoint."""
     from lerobot_roborecover.policies.export_ema import export_ema
 
-    count = export_ema(args.checkpoint.resolve(), args.out)
-    print(f"{args.out}: {count} averaged parameter tensors\nuse it with --policy.path={args.out}")
+    count = export_ema(options.checkpoint.resolve(), options.out)
+    print(f"{options.out}: {count} averaged parameter tensors\nuse it with --policy.path={options.out}")
     return 0

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from lerobot_roborecover._version import __version__
+from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.cli.tree import (
     COMMANDS,
@@ -31,18 +31,17 @@ def command_module(name: str) -> ModuleType:
     return importlib.import_module(f"lerobot_roborecover.cli.{name}")
 
 
-def command_parser(call: Call) -> argparse.ArgumentParser:
+def command_parser(call: Call) -> Parser:
     """Returns the parser of one command, which says the name that was typed."""
     module = command_module(call.module)
-    parser = argparse.ArgumentParser(prog=f"roborecover {call.name}", description=module.HELP)
-    module.add_arguments(parser)
-    parser.set_defaults(run=module.run)
+    parser = Parser(prog=f"roborecover {call.name}", description=module.HELP)
+    _add_arguments(parser, module)
     return parser
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """Returns one parser of all commands, for tables and for shell completion; imports nothing heavy."""
-    parser = argparse.ArgumentParser(prog="roborecover", description="How robot policies recover.")
+    parser = Parser(prog="roborecover", description="How robot policies recover.")
     parser.add_argument("--version", action="version", version=f"roborecover {__version__}")
     top = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in in_group(""):
@@ -54,10 +53,15 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_command(commands: argparse._SubParsersAction, command: Command) -> None:
+def _add_command(commands: Any, command: Command) -> None:
     module = command_module(command.module)
-    parser = commands.add_parser(command.word, help=command.summary, description=module.HELP)
-    if hasattr(module, "add_arguments"):
+    _add_arguments(commands.add_parser(command.word, help=command.summary, description=module.HELP), module)
+
+
+def _add_arguments(parser: Parser, module: ModuleType) -> None:
+    if hasattr(module, "OPTIONS"):
+        add_options(parser, module.OPTIONS)
+    elif hasattr(module, "add_arguments"):
         module.add_arguments(parser)
 
 
@@ -92,10 +96,10 @@ def _run(call: Call) -> int:
     if hasattr(module, "pass_through"):
         return module.pass_through(list(call.rest))
     args = command_parser(call).parse_args(call.rest)
-    return args.run(args)
+    return module.run(read_options(module.OPTIONS, args) if hasattr(module, "OPTIONS") else args)
 
 
-class _ListParser(argparse.ArgumentParser):
+class _ListParser(Parser):
     """Takes `--help` and `--version` where no command is named; its help is a text of ours."""
 
     def __init__(self, prog: str, text: str) -> None:
@@ -103,7 +107,7 @@ class _ListParser(argparse.ArgumentParser):
         self.text = text
         self.add_argument("--version", action="version", version=f"roborecover {__version__}")
         self.add_argument("command", nargs="?")
-        self.add_argument("rest", nargs=argparse.REMAINDER)
+        self.add_argument("rest", nargs="...")
 
     def format_help(self) -> str:
         return self.text

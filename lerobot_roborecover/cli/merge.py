@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.cli.old_options import renamed
+from lerobot_roborecover.utils.options import option
 
 HELP = "join the trial logs of shards; refuses logs of different protocols"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `roborecover merge`."""
-    parser.add_argument("logs", nargs="+", type=Path, help="trial logs")
-    parser.add_argument("--out", required=True, type=Path, help="the merged log")
-    parser.add_argument("--force", action="store_true", help="replace a file that exists at --out")
-    parser.add_argument(
-        "--allow-unequal-trials", action="store_true", help="accept scenarios with fewer trials than others"
-    )
-    renamed(parser, "--allow-unequal-trials", "--unequal")
+@dataclass(frozen=True, kw_only=True)
+class MergeOptions:
+    """Which logs to join."""
+
+    logs: tuple[Path, ...] = option(positional=True)
+    """Trial logs."""
+    out: Path
+    """The merged log."""
+    force: bool = False
+    """Replace a file that exists at --out."""
+    allow_unequal_trials: bool = option(False, old=("unequal",))
+    """Accept scenarios with fewer trials than others."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = MergeOptions
+
+
+def run(options: MergeOptions) -> int:
     """Merges and says what came together."""
     from lerobot_roborecover.logs.merge import merge
     from lerobot_roborecover.utils.text import pluralize
 
-    merged = merge(args.logs, args.out, unequal=args.allow_unequal_trials, force=args.force)
+    merged = merge(options.logs, options.out, unequal=options.allow_unequal_trials, force=options.force)
     scenarios = len({r.scenario_id for r in merged.rows})
     for remark in merged.remarks:
         print(f"note: {remark}", file=sys.stderr)
     found = f"{pluralize(len(merged.rows), 'trial')} of {pluralize(scenarios, 'scenario')}"
-    print(f"{found} from {pluralize(len(args.logs), 'log')} in {args.out}")
+    print(f"{found} from {pluralize(len(options.logs), 'log')} in {options.out}")
     return 0

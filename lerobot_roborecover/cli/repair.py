@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+
+from lerobot_roborecover.utils.options import option
 
 HELP = "Rebuild a dataset's meta/roborecover after LeRobot's tools (merge, delete, split) have worked on it."
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add = parser.add_argument
-    add("dataset", type=Path, help="folder that a tool has made")
-    add(
-        "--from", dest="sources", nargs="+", required=True, metavar="SOURCE", help="datasets it was made from"
-    )
-    add("--dry-run", action="store_true", help="say what would be done, and change nothing")
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions:
+    """What to repair."""
+
+    dataset: Path = option(positional=True)
+    """Folder that a tool has made."""
+    sources: tuple[str, ...] = option(name="from", nargs="+", metavar="SOURCE")
+    """Datasets it was made from."""
+    dry_run: bool = False
+    """Say what would be done, and change nothing."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = RepairOptions
+
+
+def run(options: RepairOptions) -> int:
     """Repairs, and says what it did."""
     from lerobot_roborecover.curation.repair import repair_dataset
 
-    print("\n".join(repair_dataset(args.dataset, args.sources, dry_run=args.dry_run).lines))
+    print("\n".join(repair_dataset(options.dataset, options.sources, dry_run=options.dry_run).lines))
     return 0

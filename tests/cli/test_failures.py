@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import io
 import os
@@ -29,7 +30,8 @@ def stands_in(monkeypatch):
     """Puts a function in the place of what `roborecover doctor` does."""
 
     def put(run):
-        module = types.SimpleNamespace(HELP="", add_arguments=lambda parser: None, run=lambda args: run())
+        options = dataclasses.make_dataclass("Options", [], module=__name__)
+        module = types.SimpleNamespace(HELP="", OPTIONS=options, run=lambda options: run())
         monkeypatch.setitem(sys.modules, "lerobot_roborecover.cli.doctor", module)
 
     return put

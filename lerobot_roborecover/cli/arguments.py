@@ -1,0 +1,135 @@
+"""Makes a command's arguments from its dataclass, and its dataclass from parsed arguments."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from lerobot_roborecover.cli.old_options import renamed
+from lerobot_roborecover.errors import RoboRecoverError
+from lerobot_roborecover.utils.options import Option, make, options_of
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose refusals are one line, and name what is nearest to what was typed."""
+
+    passes: tuple[str, ...] = ()
+    """Beginnings of options that another parser reads."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parses, after a look at the options' names: a wrong one is named before a missing one."""
+        words = list(sys.argv[1:] if args is None else args)
+        if not any(action.nargs in (argparse.PARSER, argparse.REMAINDER) for action in self._actions):
+            self._refuse_unknown(words)
+        return super().parse_known_args(words, namespace)
+
+    def _refuse_unknown(self, words: Sequence[str]) -> None:
+        known = list(self._option_string_actions)
+        for word in words:
+            if word == "--":
+                break
+            name = word.partition("=")[0]
+            if not name.startswith("--") or " " in word or name.startswith(self.passes or ("---",)):
+                continue
+            if not any(one.startswith(name) for one in known):
+                near = nearest(name, self._visible())
+                self.error(
+                    f"there is no option {name[:80]}; "
+                    + (f"the nearest is {near}" if near else f'"{self.prog} --help" lists them')
+                )
+
+    def _visible(self) -> list[str]:
+        return [s for a in self._actions if a.help != argparse.SUPPRESS for s in a.option_strings]
+
+    def error(self, message: str) -> NoReturn:
+        """Ends with one line, and exit status 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """Returns the name that is most like a word; empty where none is."""
+    from difflib import get_close_matches
+
+    return next(iter(get_close_matches(word, known, 1)), "")
+
+
+def add_options(parser: argparse.ArgumentParser, kind: type) -> None:
+    """Adds the options of a dataclass.
+
+    Args:
+        parser: of the command.
+        kind: the command's dataclass.
+    """
+    groups: dict[str, Any] = {"": parser}
+    for one in options_of(kind):
+        if one.group not in groups:
+            groups[one.group] = parser.add_argument_group(one.group)
+        place = groups[one.group]
+        if one.spec.positional:
+            place.add_argument(one.key, **_settings(one))
+            continue
+        flag = f"--{one.name}"
+        place.add_argument(flag, dest=one.key, **_settings(one))
+        if one.spec.old:
+            renamed(place, flag, *(f"--{old}" for old in one.spec.old))
+
+
+def read_options[Options](kind: type[Options], namespace: argparse.Namespace) -> Options:
+    """Makes a command's dataclass from the arguments that `add_options` added."""
+    return make(kind, vars(namespace))
+
+
+def _settings(one: Option) -> dict[str, Any]:
+    """What argparse is told of an option."""
+    spec, text = one.spec, one.help.replace("%", "%%")
+    if one.kind is bool:
+        return {"action": "store_true", "help": text}
+    found: dict[str, Any] = {"help": text, "type": _type(one), "metavar": spec.metavar}
+    if one.choices:
+        found["choices"] = one.choices
+    if spec.nargs is not None:
+        found["nargs"] = spec.nargs
+    elif one.count:
+        found["nargs"] = one.count
+    elif one.repeated and spec.positional:
+        found["nargs"] = "+" if one.required else "*"
+    elif spec.positional and not one.required:
+        found["nargs"] = "?"
+    if one.repeated and not spec.positional and spec.nargs is None:
+        found["action"] = "append"
+    if spec.const is not None:
+        found["const"] = spec.const
+    if one.required:
+        return found if spec.positional else {**found, "required": True}
+    if not spec.show_default:
+        return found
+    value = one.default if spec.text is None else spec.text
+    return {**found, "default": list(value) if isinstance(value, tuple) else getattr(value, "value", value)}
+
+
+def _type(one: Option) -> Callable[[str], Any] | None:
+    """Reads one word; refuses with a reason."""
+    choices, parse = one.choices, one.spec.parse
+    if choices:
+
+        def chosen(text: str) -> str:
+            if text in choices:
+                return text
+            near = nearest(text, choices)
+            hint = f"; the nearest is {near}" if near else ""
+            raise argparse.ArgumentTypeError(f"{text!r:.80} is not one of {', '.join(choices)}{hint}")
+
+        return chosen
+    if parse:
+
+        def parsed(text: str) -> Any:
+            try:
+                return parse(text)
+            except RoboRecoverError as err:
+                raise argparse.ArgumentTypeError(str(err)) from None
+
+        parsed.__name__ = getattr(parse, "__name__", "value")
+        return parsed
+    return None if one.kind is str else one.kind
