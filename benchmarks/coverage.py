@@ -1,6 +1,6 @@
 """How often every printed interval holds what it speaks of, and how often every printed test is wrong.
 
-    python benchmarks/coverage.py                      # the table of docs/report.md, minutes on one core
+    python benchmarks/coverage.py                      # table of docs/log/statistics.md, minutes on one core
     python benchmarks/coverage.py --replicates 200     # a first look
     python benchmarks/coverage.py --only rates         # one part: see --help
     python benchmarks/coverage.py --worst              # and the worst setting of each line

@@ -11,7 +11,7 @@ here is measured on a GPU: put in yours.
 Where the defaults are from: 73 ms are pi0's 10 denoising steps on an RTX 4090 (Black et al. 2024, arXiv
 2410.24164, appendix D); 2 ms more for each observation in a batch are vla-eval's 486 observations a second on
 one H100 (arXiv 2603.13966), of another model; 12 ms are LIBERO's step without a picture on one core
-(docs/performance.md); 10 ms for two pictures are a guess.
+(docs/log/performance.md); 10 ms for two pictures are a guess.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def overall(results: Results) -> Table:
         "as failures, except under “RSR % without invalid”, where they and scenarios without a valid trial "
         "are left out.",
         f"[{100 * draws.level:g} % intervals] of rates: Agresti-Coull with the effective number of "
-        f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not (docs/report.md), "
-        "and Clopper-Pearson where no trial or every trial succeeds; "
+        f"{results.unit} ({draws.units} of them), which covers where a bootstrap does not "
+        "(docs/statistics.md), and Clopper-Pearson where no trial or every trial succeeds; "
         f"they speak of {ESTIMAND[panel.unit(results.options.cluster)]}. {_of_tasks(results)}Percentile "
         f"bootstrap, as in the paper: {draws.draws} draws, seed {draws.seed}, to compare with the paper.",
         *(f"Incomplete: {arm.title}: {arm.missing.words}." for arm in results.arms if arm.missing),

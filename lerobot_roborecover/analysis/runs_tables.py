@@ -37,7 +37,7 @@ def methods(results: Results) -> Table:
         "at hand. Runs like these: with the variance between runs and that between "
         f"{results.unit}, Student's t with few degrees of freedom where runs are few: it speaks of the "
         "method. Hierarchical bootstrap: runs, units, scenarios and trials drawn anew; with few runs it "
-        "covers less than it says (docs/report.md).",
+        "covers less than it says (docs/statistics.md).",
         "By trials alone: the SD that the runs would show were they one and the same policy.",
     )
     return Table("methods", "Methods of several runs", columns, tuple(rows), notes)

@@ -14,7 +14,7 @@ class Costs:
     """Parameters of the estimate, none of them measured: put in those of `roborecover check policy`."""
 
     step_ms: float = 12.0
-    """Of a simulator, without picture. LIBERO's, on one core (docs/performance.md)."""
+    """Of a simulator, without picture. LIBERO's, on one core (docs/log/performance.md)."""
     picture_ms: float = 20.0
     """Of all cameras, whenever the policy looks. A guess for two cameras on a GPU."""
     inference_ms: float = 100.0

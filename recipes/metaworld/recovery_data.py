@@ -36,7 +36,7 @@ POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "dif
 """Policies whose recoveries are learned from, and their trials of each training scenario."""
 STORED = OUTCOMES / "recovery_data"
 SEEDS = (0, 1, 2, 3)
-"""Of training: four runs are the fewest of which a verdict on methods is given (docs/report.md)."""
+"""Of training: four runs are the fewest of which a verdict on methods is given (docs/statistics.md)."""
 
 
 @dataclass(frozen=True)

@@ -136,9 +136,9 @@ def test_mappings_that_are_refused(text, words):
 
 
 def test_the_example_of_the_docs_is_a_mapping():
-    page = (Path(__file__).parents[2] / "docs" / "remote.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "servers.md").read_text()
     (example,) = re.findall(r"```yaml\n(version.*?)```", page, re.DOTALL)
-    assert parse_mapping(example, "docs/remote.md").window.frames == 2
+    assert parse_mapping(example, "docs/servers.md").window.frames == 2
 
 
 def test_a_mapping_is_found_by_name_or_path(tmp_path):

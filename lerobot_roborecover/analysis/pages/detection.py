@@ -74,7 +74,7 @@ def ranking_table(measured: Sequence[MeasuredDetector], level: float) -> Table:
         rows.append((*cells, m.report.calibrated.brier, m.report.calibrated.ece, m.cost_ms))
     base = ", ".join(f"{100 * v:.1f} % of the frames labelled `{k}`" for k, v in shares.items())
     notes = (
-        f"In per cent with {100 * level:g} % intervals over scenarios (docs/report.md, Intervals and tests). "
+        f"In per cent with {100 * level:g} % intervals over scenarios (docs/statistics.md, Intervals). "
         "Needs help: 1 from the recovery point on in a trial that fails, 0 in one that succeeds and in "
         "successful clean rollouts. Deviated: 1 from the recovery point on, 0 before it. A detector that "
         f"knows nothing has AUROC 50 and as AP the share of label 1: {base}. Brier and ECE are of needing "

@@ -63,7 +63,7 @@ def metrics_table(measured: Sequence[Measured], level: float) -> Table:
     columns = (Column("Validation"), *(Column(TITLES[m], "percent") for m in METRICS))
     rows = tuple((m.name, *(m.report.metrics[k] for k in METRICS)) for m in measured)
     note = (
-        f"In per cent with {100 * level:g} % intervals over scenarios (docs/report.md, Intervals and tests). "
+        f"In per cent with {100 * level:g} % intervals over scenarios (docs/statistics.md, Intervals). "
         "Precision, recall and F1 are of label 1."
     )
     return Table("metrics", "Frames", columns, rows, (note,))

@@ -1,6 +1,6 @@
 """Intervals that cover: of rates, of paired differences and of ratios, over units of any size.
 
-Chosen by simulation (`benchmarks/coverage.py`; its table is in docs/report.md). A percentile bootstrap of few
+Chosen by simulation (`benchmarks/coverage.py`; table: docs/statistics.md). A percentile bootstrap of few
 scenarios, or of a rate near 0 or 1, knows only the values that it drew, and misses far more often than it
 says.
 

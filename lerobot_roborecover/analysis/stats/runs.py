@@ -11,8 +11,8 @@ rule, no more than `CAUTION` for each degree of freedom that the runs have; the 
 
 Beside it stands the hierarchical bootstrap (runs, units, scenarios within them, trials within these;
 percentile bounds), as it is used in the field (rliable, Agarwal et al. 2021, resamples runs the same way).
-With few runs it knows too little of how far others would lie, and covers less than it says: docs/report.md
-has both measured.
+With few runs it knows too little of how far others would lie, and covers less than it says
+(docs/log/statistics.md).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from lerobot_roborecover.analysis.stats.verdicts import LEAST_RUNS, ComparisonVe
 
 CAUTION = 2.0
 """Most degrees of freedom of an interval for each that the runs have: a variance between two or three runs
-is often far too small by chance, and would pass for a certain one (docs/report.md)."""
+is often far too small by chance, and would pass for a certain one (docs/statistics.md)."""
 _DRAWS = 2000
 
 

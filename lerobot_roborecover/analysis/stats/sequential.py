@@ -8,7 +8,7 @@ confidence sequence of a rate.
   chance of being crossed for the first time, by a walk that has crossed none before, is within what is left.
   It is exact, needs the number of units beforehand (as STEP does, Snyder et al. 2025, arXiv 2503.10966), and
   keeps nearly all the power of one look at the end; a betting e-process, which needs no such number, loses up
-  to half of it (docs/report.md has both).
+  to half of it (docs/log/statistics.md has both).
 - **Rates and differences** have confidence sequences by betting (Waudby-Smith and Ramdas 2024): against
   every candidate mean a gambler bets, with several stakes at once; where he has made twenty times the stake,
   the candidate is left out (Ville's inequality). They hold at any time, for any law of the scenarios, and are

@@ -31,7 +31,7 @@ from lerobot_roborecover.workers.messages import EpisodeSpec
 
 SAME_ACTION = 1e-4
 """How far an action may be from the logged one where the policy is led through a trial: what a batch of
-another size changes (docs/policies.md)."""
+another size changes (docs/evaluate.md)."""
 OWN, ANOTHER = "own", "another"
 """Random streams of continuations that check (`ForkNote.stream`)."""
 
