@@ -2,7 +2,7 @@
 
     python conversion/lerobot_rollouts.py DATASET_FOLDER --platform libero --driver pi05 --out DIR
 
-Videos are copied, not encoded again. What cannot be replayed exactly is marked so: docs/convert.md.
+Videos are copied, not encoded again. What cannot be replayed exactly is marked so: docs/publish.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python conversion/libero_hdf5.py TASK_demo.hdf5 ... --out DIR
 
-What cannot be replayed exactly is marked so, episode by episode, with the reason: docs/convert.md.
+What cannot be replayed exactly is marked so, episode by episode, with the reason: docs/publish.md.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
     python conversion/roborecover_release.py DIR/libero DIR/robotwin --export --out RELEASE2
 
 Actions stay float64, unclipped and unpadded; fields without a place of their own go to the provenance. A
-record that fails is reported by file and field, and the rest goes on. Rules and limits: docs/convert.md.
+record that fails is reported by file and field, and the rest goes on. Rules and limits: docs/publish.md.
 """
 
 from __future__ import annotations

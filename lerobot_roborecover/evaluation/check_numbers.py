@@ -105,7 +105,7 @@ def check_states(states: np.ndarray, stats: Stats | None, platform: str) -> Find
             f"{len(dims)} of {len(outside)} values far outside: {shown}",
             "states of the training data's kind: same robot, same units, same order",
             "the checkpoint is of another robot, or reads another state (end effector or joints, metres or "
-            "radians, order of values). Compare with the env's state in docs/policies.md",
+            "radians, order of values). Compare with the env's state in docs/servers.md",
         )
     return warning(
         name,

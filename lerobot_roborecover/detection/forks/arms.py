@@ -19,7 +19,7 @@ ARMS = {
     "rollback:K": "K steps back, and the same policy with fresh history",
     "correction:CHECKPOINT": "a correction policy for some steps, then the same policy with fresh history",
     "policy:CHECKPOINT": "another policy",
-    "human:MODULE:FUNCTION": "a person, through a driver (docs/teleop.md)",
+    "human:MODULE:FUNCTION": "a person, through a driver (docs/interventions.md)",
 }
 """In the words of `--arm`."""
 MAX_BACK = 100_000

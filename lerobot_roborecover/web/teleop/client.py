@@ -55,7 +55,7 @@ class Client:
         self._timeout_s = timeout_s
         self._next = 1
         self.status: dict[str, Any] = {}
-        """The latest: `step`, `solved`, `mark`, `proven`, `eef_m` and the rest (docs/teleop.md)."""
+        """The latest: `step`, `solved`, `mark`, `proven`, `eef_m` and the rest (docs/build.md)."""
         self.state: dict[str, Any] = {}
         """As of the last `start`, `act` or `look`: `bodies` (position and quaternion xyzw, exact) and
         `low_dim` (Meta-World's 39 numbers; None elsewhere)."""

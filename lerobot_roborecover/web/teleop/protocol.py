@@ -1,4 +1,4 @@
-"""What page and server say to each other over one websocket; `docs/teleop.md` has the same as a table.
+"""What page and server say to each other over one websocket.
 
 Text messages are JSON objects. The server's pictures are binary: one byte camera, three bytes zero, four
 bytes step (little-endian), then a JPEG.
