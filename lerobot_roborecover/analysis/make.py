@@ -13,7 +13,7 @@ from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.headline import headline
 from lerobot_roborecover.analysis.logs import Study, read_study
 from lerobot_roborecover.analysis.named_path import split_named
-from lerobot_roborecover.analysis.options import Options
+from lerobot_roborecover.analysis.options import Gallery, Options
 from lerobot_roborecover.analysis.pages.gallery import check_scenarios
 from lerobot_roborecover.analysis.pages.media import find_clips
 from lerobot_roborecover.analysis.pages.report import REPORT_FILES, Extras, ReportFiles, write_report
@@ -42,23 +42,6 @@ class Report:
             f"{headline(self.results)}\n\n{overall}\n\nreport    {self.files.html}\nmarkdown  "
             f"{self.files.markdown}\ntables    {out / 'tables'}\nnumbers   {self.files.results}"
         )
-
-
-@dataclass(frozen=True)
-class Gallery:
-    """What a report's scenario gallery shows, beside outcomes."""
-
-    scenarios: str | None = None
-    """The evaluated set (shipped name, folder, Hub id): the logs are checked against it, and its recorded
-    frames are shown."""
-    revision: str | None = None
-    """Of that set on the Hub."""
-    render: bool = False
-    """Render recovery frames that the set does not hold; runs the simulator."""
-    videos: Sequence[str] = ()
-    """`DIR` or `NAME=DIR` with videos of `lerobot-eval`, NAME being the policy's."""
-    videos_mb: int = 64
-    """Take in at most so many megabytes of them."""
 
 
 def report(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from lerobot_roborecover.cli.report import add_log_arguments, analysis_options
+from lerobot_roborecover.cli.report import LogOptions
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Compare two policies from their trial logs: difference, interval, adjusted p, where it comes "
@@ -15,41 +15,45 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add_log_arguments(parser)
-    parser.add_argument("--a", metavar="NAME", help="first policy, where the logs hold more than two")
-    parser.add_argument("--b", metavar="NAME", help="second policy")
-    parser.add_argument(
-        "--sequential",
-        action="store_true",
-        help="the logs are still growing, and looked at more than once: p and interval hold at every look",
-    )
-    parser.add_argument(
-        "--scenarios",
-        help="with --sequential: the set that the runs were to evaluate (shipped name, folder, Hub id) where "
-        "the logs do not name all of it yet",
-    )
-    parser.add_argument("--revision", help="commit, tag or branch of that set on the Hub")
-    parser.add_argument("--select", default="", help="the runs' --env.select")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(LogOptions):
+    """Which two policies to compare."""
+
+    a: str | None = option(None, metavar="NAME")
+    """First policy, where the logs hold more than two."""
+    b: str | None = option(None, metavar="NAME")
+    """Second policy."""
+    sequential: bool = False
+    """The logs are still growing, and looked at more than once: p and interval hold at every look."""
+    scenarios: str | None = None
+    """With --sequential: the set that the runs were to evaluate (shipped name, folder, Hub id) where the logs
+    do not name all of it yet."""
+    revision: str | None = None
+    """Commit, tag or branch of that set on the Hub."""
+    select: str = ""
+    """The runs' --env.select."""
+    json: bool = False
+    """Print JSON."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = CompareOptions
+
+
+def run(options: CompareOptions) -> int:
     """Prints the comparison."""
     from lerobot_roborecover.analysis.compare import compare, to_json, to_screen
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.sequential_plan import planned_units
     from lerobot_roborecover.analysis.stats.estimators import RowsError
 
-    if args.scenarios and not args.sequential:
+    if options.scenarios and not options.sequential:
         raise RowsError(
-            f"--scenarios {args.scenarios} says what --sequential plans for; give both or neither"
+            f"--scenarios {options.scenarios} says what --sequential plans for; give both or neither"
         )
-    study, planned = read_study(args.logs, args.platform), None
-    if args.scenarios:
-        planned = planned_units(study, args.scenarios, args.revision, args.select)
-    options = replace(analysis_options(args), sequential=args.sequential, planned=planned)
-    found = compare(study, args.a, args.b, options)
-    print(json.dumps(to_json(found), indent=1) if args.json else to_screen(found))
+    study, planned = read_study(options.logs, options.platform), None
+    if options.scenarios:
+        planned = planned_units(study, options.scenarios, options.revision, options.select)
+    how = replace(options.analysis, sequential=options.sequential, planned=planned)
+    found = compare(study, options.a, options.b, how)
+    print(json.dumps(to_json(found), indent=1) if options.json else to_screen(found))
     return 0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Plan an evaluation before it is run: how many scenarios and trials separate two policies that differ by "
@@ -12,70 +14,44 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add = parser.add_argument
-    add(
-        "--pilot",
-        action="append",
-        default=[],
-        metavar="[NAME=]LOG",
-        help="trial log of one policy or two, for rate, scatter and correlation; may be given again",
-    )
-    add(
-        "--rate",
-        type=float,
-        metavar="PERCENT",
-        help="success rate of the worse policy (default: the pilot's)",
-    )
-    add(
-        "--sd",
-        type=float,
-        metavar="POINTS",
-        help="standard deviation of a policy's true rates between scenarios (default: the pilot's, else that "
-        "of a third of the greatest variance)",
-    )
-    add(
-        "--correlation",
-        type=float,
-        help="of the two policies' true rates over scenarios (default: the pilot's, else 0.5)",
-    )
-    add(
-        "--difference",
-        type=float,
-        nargs="+",
-        metavar="POINTS",
-        help="true differences to plan for (default: 5 10 15 20, as far as the rate leaves room)",
-    )
-    add(
-        "--trials",
-        type=int,
-        nargs="+",
-        default=[1, 2, 3, 4, 5],
-        metavar="K",
-        help="trials of a scenario (default: 1 to 5)",
-    )
-    add(
-        "--scenarios",
-        metavar="N|SET",
-        help="scenarios at hand, a number or a set (shipped name, folder, Hub id): the least difference that "
-        "they can show",
-    )
-    add("--revision", help="commit, tag or branch of that set on the Hub")
-    add("--split", help="split of that set")
-    add("--power", type=float, default=80.0, metavar="PERCENT", help="wanted chance (%(default)g)")
-    add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
-    add(
-        "--family",
-        type=int,
-        default=1,
-        metavar="PAIRS",
-        help="pairs that p will be adjusted for: 15 for six policies (%(default)s)",
-    )
-    add("--out", type=Path, metavar="DIR", help="folder for the tables (CSV, Markdown) and the figure")
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """What is believed of two policies, and what is asked."""
+
+    pilot: tuple[str, ...] = option((), metavar="[NAME=]LOG")
+    """Trial log of one policy or two, for rate, scatter and correlation; may be given again."""
+    rate: float | None = option(None, metavar="PERCENT")
+    """Success rate of the worse policy (default: the pilot's)."""
+    sd: float | None = option(None, metavar="POINTS")
+    """Standard deviation of a policy's true rates between scenarios (default: the pilot's, else that of a
+    third of the greatest variance)."""
+    correlation: float | None = None
+    """Of the two policies' true rates over scenarios (default: the pilot's, else 0.5)."""
+    difference: tuple[float, ...] | None = option(None, nargs="+", metavar="POINTS")
+    """True differences to plan for (default: 5 10 15 20, as far as the rate leaves room)."""
+    trials: tuple[int, ...] = option((1, 2, 3, 4, 5), nargs="+", metavar="K")
+    """Trials of a scenario (default: 1 to 5)."""
+    scenarios: str | None = option(None, metavar="N|SET")
+    """Scenarios at hand, a number or a set (shipped name, folder, Hub id): the least difference that they can
+    show."""
+    revision: str | None = None
+    """Commit, tag or branch of that set on the Hub."""
+    split: str | None = None
+    """Split of that set."""
+    power: float = option(80, metavar="PERCENT")
+    """Wanted chance."""
+    level: float = 0.95
+    """Confidence level."""
+    family: int = option(1, metavar="PAIRS")
+    """Pairs that p will be adjusted for: 15 for six policies."""
+    out: Path | None = option(None, metavar="DIR")
+    """Folder for the tables (CSV, Markdown) and the figure."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = PlanOptions
+
+
+def run(options: PlanOptions) -> int:
     """Prints the plan, and writes it where asked."""
     from lerobot_roborecover.analysis.figures.plan import detectable_figure
     from lerobot_roborecover.analysis.figures.style import png_of, svg_of
@@ -85,16 +61,16 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.utils.atomic_io import atomic_write
     from lerobot_roborecover.utils.outputs import check_page
 
-    _check(args)
-    guess, remarks = _guess(args)
-    wanted, trials, given = args.power / 100, sorted(set(args.trials)), args.difference
+    _check(options)
+    guess, remarks = _guess(options)
+    wanted, trials, given = options.power / 100, sorted(set(options.trials)), options.difference
     room = 1 - guess.rate
     differences = [d / 100 for d in given] if given else [d for d in (0.05, 0.1, 0.15, 0.2) if d < room]
-    common = wanted, args.level, args.family
+    common = wanted, options.level, options.family
     tables = []
     at = None
-    if args.scenarios is not None:
-        at, shared = _scenarios(args)
+    if options.scenarios is not None:
+        at, shared = _scenarios(options, options.scenarios)
         remarks += shared
     if at is not None:
         tables.append(detectable_table(guess, at, trials, *common))
@@ -104,35 +80,35 @@ def run(args: argparse.Namespace) -> int:
         print(f"{table.title}\n\n{to_text(table)}\n")
     for remark in remarks:
         print(f"note: {remark}", file=sys.stderr)
-    if args.out is not None:
+    if options.out is not None:
         files = ("plan.md", "plan.svg", "plan.png", *(f"{table.name}.csv" for table in tables))
-        check_page(args.out, files, lambda page: b"](plan.svg)" in page.read_bytes())
+        check_page(options.out, files, lambda page: b"](plan.svg)" in page.read_bytes())
         figure = detectable_figure(guess, trials, *common, at=at, differences=differences)
         text = f"![{figure.title}](plan.svg)\n\n" + "\n".join(to_markdown(table) for table in tables)
-        atomic_write(args.out / "plan.md", text)
+        atomic_write(options.out / "plan.md", text)
         for table in tables:
-            atomic_write(args.out / f"{table.name}.csv", to_csv(table))
-        atomic_write(args.out / "plan.svg", svg_of(figure.plot))
-        atomic_write(args.out / "plan.png", png_of(figure.plot))
-        print(f"plan      {args.out / 'plan.md'}\nfigure    {args.out / 'plan.svg'}")
+            atomic_write(options.out / f"{table.name}.csv", to_csv(table))
+        atomic_write(options.out / "plan.svg", svg_of(figure.plot))
+        atomic_write(options.out / "plan.png", png_of(figure.plot))
+        print(f"plan      {options.out / 'plan.md'}\nfigure    {options.out / 'plan.svg'}")
     return 0
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(options: PlanOptions) -> None:
     from lerobot_roborecover.analysis.stats.estimators import RowsError
 
-    if not 5 <= args.power < 100:
-        raise RowsError(f"--power={args.power:g} is not a chance from 5 to below 100 per cent")
-    if not 0.5 <= args.level < 1:
-        raise RowsError(f"--level={args.level:g} is not a confidence level from 0.5 to below 1")
-    if not 1 <= args.family <= 1_000_000:
-        raise RowsError(f"--family={args.family} is not a number of pairs from 1 to a million")
-    for k in args.trials:
+    if not 5 <= options.power < 100:
+        raise RowsError(f"--power={options.power:g} is not a chance from 5 to below 100 per cent")
+    if not 0.5 <= options.level < 1:
+        raise RowsError(f"--level={options.level:g} is not a confidence level from 0.5 to below 1")
+    if not 1 <= options.family <= 1_000_000:
+        raise RowsError(f"--family={options.family} is not a number of pairs from 1 to a million")
+    for k in options.trials:
         if not 1 <= k <= 1000:
             raise RowsError(f"--trials {k}: a scenario has from 1 to 1000 trials")
 
 
-def _guess(args: argparse.Namespace):
+def _guess(options: PlanOptions):
     """What is believed, and what to know about it."""
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.stats.estimators import RowsError
@@ -141,13 +117,15 @@ def _guess(args: argparse.Namespace):
     from lerobot_roborecover.analysis.stats.units import ResamplingUnit
     from lerobot_roborecover.scenario import Start
 
-    rate = None if args.rate is None else args.rate / 100
-    if not args.pilot:
+    rate = None if options.rate is None else options.rate / 100
+    if not options.pilot:
         if rate is None:
             raise RowsError("neither --pilot nor --rate: say what success rate to expect of the worse policy")
-        sd = (rate * (1 - rate) / 3) ** 0.5 if args.sd is None and 0 < rate < 1 else (args.sd or 0) / 100
-        return PowerAssumptions(rate, sd, 0.5 if args.correlation is None else args.correlation), []
-    study = read_study(args.pilot)
+        sd = (options.sd or 0) / 100
+        if options.sd is None and 0 < rate < 1:
+            sd = (rate * (1 - rate) / 3) ** 0.5
+        return PowerAssumptions(rate, sd, 0.5 if options.correlation is None else options.correlation), []
+    study = read_study(options.pilot)
     arms = study.of(Start.RECOVERY)
     if not 1 <= len(arms) <= 2:
         names = ", ".join(arm.title for arm in arms) or "none"
@@ -156,9 +134,9 @@ def _guess(args: argparse.Namespace):
             "or two. Name those logs alone"
         )
     panel = make_panel(arms)
-    guess = guess_from(panel, rate, args.correlation)
-    if args.sd is not None:
-        guess = PowerAssumptions(guess.rate, args.sd / 100, guess.correlation)
+    guess = guess_from(panel, rate, options.correlation)
+    if options.sd is not None:
+        guess = PowerAssumptions(guess.rate, options.sd / 100, guess.correlation)
     remarks = list(study.remarks)
     if panel.unit() is not ResamplingUnit.SCENARIO:
         remarks.append(
@@ -167,11 +145,10 @@ def _guess(args: argparse.Namespace):
     return guess, remarks
 
 
-def _scenarios(args: argparse.Namespace) -> tuple[int, list[str]]:
+def _scenarios(options: PlanOptions, text: str) -> tuple[int, list[str]]:
     """How many there are: a number, or those of a set; and what to know about them."""
     from lerobot_roborecover.analysis.stats.estimators import RowsError
 
-    text = args.scenarios
     if text.lstrip("-").isdigit() and not Path(text).exists():
         if not 6 <= int(text) <= 1_000_000:
             raise RowsError(
@@ -180,7 +157,7 @@ def _scenarios(args: argparse.Namespace) -> tuple[int, list[str]]:
         return int(text), []
     from lerobot_roborecover.datasets import load_scenarios
 
-    found = load_scenarios(text, revision=args.revision, split=args.split)
+    found = load_scenarios(text, revision=options.revision, split=options.split)
     states = len({scenario.first_state_sha256() for scenario in found})
     if states == len(found):
         return len(found), []

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_roborecover.cli.old_options import renamed
+from lerobot_roborecover.analysis.options import Gallery, Options
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Turn trial logs into a report: tables with intervals, figures and a scenario gallery in one "
@@ -16,111 +17,43 @@ HELP = (
 )
 
 
-def add_log_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments that say which trials, and how they are resampled; shared by the commands on trial logs."""
-    add = parser.add_argument
-    add(
-        "logs",
-        nargs="+",
-        metavar="[NAME=]LOG[,LOG]",
-        help="trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name; several "
-        "after one NAME are runs of one method",
-    )
-    add("--platform", help="take this platform's rows only")
-    add(
-        "--shared-scenarios-only",
-        action="store_true",
-        help="rank all policies on the scenarios that all were run on (default: those that were run on all)",
-    )
-    add(
-        "--baseline",
-        help="policy that interventions are compared with, where it does not follow from the logs",
-    )
-    add(
-        "--intervention",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="treat this policy as an intervention although no trial of it shows one; may be given again",
-    )
-    add_draws_arguments(parser)
-    renamed(parser, "--shared-scenarios-only", "--common")
+@dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """Which trials, and how they are analysed; shared by the commands on trial logs."""
+
+    logs: tuple[str, ...] = option(positional=True, metavar="[NAME=]LOG[,LOG]")
+    """Trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name; several after one
+    NAME are runs of one method."""
+    platform: str | None = None
+    """Take this platform's rows only."""
+    analysis: Options = field(default_factory=Options)
 
 
-def add_draws_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the resampling."""
-    add = parser.add_argument
-    add(
-        "--trials",
-        type=int,
-        help="trials scheduled per recovery point; those without a row then count as failures",
-    )
-    add("--draws", type=int, default=10_000, help="bootstrap draws (%(default)s)")
-    add("--seed", type=int, default=0, help="seed of the draws (%(default)s)")
-    add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
-    add(
-        "--cluster",
-        choices=("scenario", "trajectory", "first_state", "task"),
-        help="what intervals and tests take as independent; task: the numbers speak of other tasks like "
-        "these (default: as the paper, trajectory on RoboTwin, else scenario; initial-state trials: first "
-        "states)",
-    )
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(LogOptions):
+    """What to report, and where to."""
+
+    out: Path = Path("outputs/report")
+    """Folder of the report."""
+    title: str = "Recovery report"
+    """Heading of the report."""
+    gallery: Gallery = field(default_factory=Gallery)
 
 
-def analysis_options(args: argparse.Namespace):
-    """`Options` from the arguments above and those that a command has of the rest."""
-    from lerobot_roborecover.analysis.options import Options
-    from lerobot_roborecover.analysis.stats.units import ResamplingUnit
-
-    return Options(
-        args.draws,
-        args.seed,
-        args.level,
-        args.trials,
-        getattr(args, "baseline", None),
-        tuple(getattr(args, "intervention", ())),
-        ResamplingUnit(args.cluster) if args.cluster else None,
-        getattr(args, "shared_scenarios_only", False),
-    )
+OPTIONS = ReportOptions
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add_log_arguments(parser)
-    add = parser.add_argument
-    add("--out", type=Path, default=Path("outputs/report"), help="folder of the report (%(default)s)")
-    add("--title", default="Recovery report", help="heading of the report (%(default)s)")
-    add(
-        "--scenarios",
-        help="the evaluated scenario set (shipped name, folder, Hub id): checks the logs against it",
-    )
-    add("--revision", help="commit, tag or branch of that set on the Hub")
-    add(
-        "--render",
-        action="store_true",
-        help="render recovery frames that the set does not hold (runs the simulator)",
-    )
-    add(
-        "--videos",
-        action="append",
-        default=[],
-        metavar="[NAME=]DIR",
-        help="videos of lerobot-eval for the gallery, named after the policy; may be given again",
-    )
-    add("--videos-mb", type=int, default=64, help="take in at most so many megabytes of video (%(default)s)")
-
-
-def run(args: argparse.Namespace) -> int:
+def run(options: ReportOptions) -> int:
     """Writes the report and prints its headline."""
-    from lerobot_roborecover.analysis.make import Gallery, report
+    from lerobot_roborecover.analysis.make import report
 
     made = report(
-        args.logs,
-        args.out,
-        platform=args.platform,
-        title=args.title,
-        options=analysis_options(args),
-        gallery=Gallery(args.scenarios, args.revision, args.render, args.videos, args.videos_mb),
+        options.logs,
+        options.out,
+        platform=options.platform,
+        title=options.title,
+        options=options.analysis,
+        gallery=options.gallery,
         command=shlex.join(["roborecover", *sys.argv[1:]]),
     )
     for remark in made.remarks:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from dataclasses import fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_roborecover.cli.old_options import renamed
+from lerobot_roborecover.reproduce.hours import Costs
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Reproduce a published score: the initial arm first, held against what is published by its interval, "
@@ -15,32 +15,39 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    from lerobot_roborecover.reproduce.hours import Costs
+@dataclass(frozen=True, kw_only=True)
+class ReproduceOptions:
+    """What to reproduce, and on which scenarios."""
 
-    add = parser.add_argument
-    add("name", nargs="?", help="of policies/eval, or a configuration file; without: what there is")
-    add("--out", type=Path, help="folder of the results; a rerun goes on there (default: outputs/NAME)")
-    add("--scenarios", metavar="SET", help="folder, Hub id or shipped set (default: the configuration's)")
-    add("--split", metavar="SPLIT", help="of the scenarios, e.g. test")
-    add("--select", metavar="EXPR", help="of the scenarios, as --env.select")
-    add("--trials", type=int, default=5, help="of each scenario in each arm (%(default)s)")
-    add("--published", metavar="RATE", help="what to hold the initial arm against, in per cent: RATE or "
-        "RATE,LOW,HIGH (default: the paper's)")  # fmt: skip
-    add("--margin", type=float, default=10.0, metavar="POINTS",
-        help="a loss that the initial arm must be able to show (%(default)s)")  # fmt: skip
-    add("--force", action="store_true", help="run the recovery arm also where the initial arm is too low")
-    add("--print", action="store_true", help="print commands and expected hours, and run nothing")
-    for field in fields(Costs):
-        add(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default,
-            help="for the expected hours alone (%(default)s)")  # fmt: skip
-    add("--set", action="append", default=[], metavar="NAME=VALUE",
-        help="option of roborecover eval for both arms, e.g. policy.device=cuda; again")  # fmt: skip
-    renamed(parser, "--force", "--anyway")
+    name: str | None = option(None, positional=True)
+    """Of policies/eval, or a configuration file; without: what there is."""
+    out: Path | None = None
+    """Folder of the results; a rerun goes on there (default: outputs/NAME)."""
+    scenarios: str | None = option(None, metavar="SET")
+    """Folder, Hub id or shipped set (default: the configuration's)."""
+    split: str | None = option(None, metavar="SPLIT")
+    """Of the scenarios, e.g. test."""
+    select: str | None = option(None, metavar="EXPR")
+    """Of the scenarios, as --env.select."""
+    trials: int = 5
+    """Of each scenario in each arm."""
+    published: str | None = option(None, metavar="RATE")
+    """What to hold the initial arm against, in per cent: RATE or RATE,LOW,HIGH (default: the paper's)."""
+    margin: float = option(10.0, metavar="POINTS")
+    """A loss that the initial arm must be able to show."""
+    force: bool = option(False, old=("anyway",))
+    """Run the recovery arm also where the initial arm is too low."""
+    print: bool = False
+    """Print commands and expected hours, and run nothing."""
+    costs: Costs = field(default_factory=Costs)
+    settings: tuple[str, ...] = option((), name="set", metavar="NAME=VALUE")
+    """Option of roborecover eval for both arms, e.g. policy.device=cuda; again."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = ReproduceOptions
+
+
+def run(options: ReproduceOptions) -> int:
     """Runs both arms and writes the report; exit status 1 where the initial arm is below what is
     published."""
     from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict
@@ -52,25 +59,25 @@ def run(args: argparse.Namespace) -> int:
         write_record,
     )
     from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, published_score
-    from lerobot_roborecover.reproduce.hours import Costs
     from lerobot_roborecover.reproduce.record import check_record, verdict
 
-    if args.name is None:
+    if options.name is None:
         print("\n".join(known_names()))
         return 0
-    checkpoint = find_checkpoint(args.name)
-    chosen = [f"--env.{n}={getattr(args, n)}" for n in ("scenarios", "split", "select") if getattr(args, n)]
+    checkpoint = find_checkpoint(options.name)
+    which = {name: getattr(options, name) for name in ("scenarios", "split", "select")}
+    chosen = [f"--env.{name}={value}" for name, value in which.items() if value]
     plan = ReproductionPlan(
         checkpoint,
-        args.out or Path("outputs") / checkpoint.name,
-        args.trials,
-        (*chosen, *(f"--{option}" for option in args.set)),
-        published_score(args.published) if args.published else checkpoint.initial,
-        args.margin / 100,
-        args.force,
-        Costs(**{field.name: getattr(args, field.name) for field in fields(Costs)}),
+        options.out or Path("outputs") / checkpoint.name,
+        options.trials,
+        (*chosen, *(f"--{one}" for one in options.settings)),
+        published_score(options.published) if options.published else checkpoint.initial,
+        options.margin / 100,
+        options.force,
+        options.costs,
     )
-    if args.print:
+    if options.print:
         scenarios = plan.scenarios()
         for start in (INITIAL, RECOVERY):
             length = plan.length(start, scenarios)

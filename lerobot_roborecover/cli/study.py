@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_roborecover.cli.old_options import renamed
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Re-run a study: every policy from recovery points and from initial states, the interventions, the "
@@ -14,35 +14,40 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add = parser.add_argument
-    add("--name", default="metaworld", help="which study: one that ships with the package (%(default)s)")
-    add("--data", type=Path, help="folder of another study")
-    add("--out", type=Path, default=Path("outputs/study"), help="folder of the results (%(default)s)")
-    add("--stride", type=int, default=1, metavar="N", help="take every N-th scenario only (%(default)s)")
-    add("--jobs", type=int, default=0, help="runs of policies at once (0: one per core)")
-    add("--slots", type=int, default=0, help="simulators at once in each (0: the cores left for it)")
-    add(
-        "--make", action="store_true",
-        help="make the study first, from nothing but the packages: train, build, fine-tune (hours)",
-    )  # fmt: skip
-    add(
-        "--shipped-scenarios", action="store_true",
-        help="with --make: take the scenarios that come with the package instead of building them",
-    )  # fmt: skip
-    add("--stage", action="append", default=[], metavar="NAME", help="with --make: this stage only; again")
-    add("--print", action="store_true", help="print the commands and run nothing")
-    add(
-        "--use-stored-outcomes", action="store_true",
-        help="run nothing: print the tables, and write the report below --out/stored, of the stored outcomes",
-    )  # fmt: skip
-    add("--no-report", action="store_true", help="stop after the trials and the comparison")
-    renamed(parser, "--stride", "--every")
-    renamed(parser, "--use-stored-outcomes", "--stored")
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Which study to run, and how much of it."""
+
+    name: str = "metaworld"
+    """Which study: one that ships with the package."""
+    data: Path | None = None
+    """Folder of another study."""
+    out: Path = Path("outputs/study")
+    """Folder of the results."""
+    stride: int = option(1, metavar="N", old=("every",))
+    """Take every N-th scenario only."""
+    jobs: int = 0
+    """Runs of policies at once (0: one per core)."""
+    slots: int = 0
+    """Simulators at once in each (0: the cores left for it)."""
+    make: bool = False
+    """Make the study first, from nothing but the packages: train, build, fine-tune (hours)."""
+    shipped_scenarios: bool = False
+    """With --make: take the scenarios that come with the package instead of building them."""
+    stages: tuple[str, ...] = option((), name="stage", metavar="NAME")
+    """With --make: this stage only; again."""
+    print: bool = False
+    """Print the commands and run nothing."""
+    use_stored_outcomes: bool = option(False, old=("stored",))
+    """Run nothing: print the tables, and write the report below --out/stored, of the stored outcomes."""
+    no_report: bool = False
+    """Stop after the trials and the comparison."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = StudyOptions
+
+
+def run(options: StudyOptions) -> int:
     """Evaluates, compares, reports; exit status 1 where outcomes differ from the stored ones."""
     from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.study.arms import arms, report_command
@@ -55,49 +60,50 @@ def run(args: argparse.Namespace) -> int:
     )
     from lerobot_roborecover.study.outcomes import outcomes_of, write_outcomes
 
-    if args.stride < 1:
-        raise OptionError(f"--stride={args.stride}: a count from 1")
+    if options.stride < 1:
+        raise OptionError(f"--stride={options.stride}: a count from 1")
     for name in ("jobs", "slots"):
-        if getattr(args, name) < 0:
-            raise OptionError(f"--{name}={getattr(args, name)}: a count; 0 follows the cores")
-    if args.stage and not args.make:
+        if getattr(options, name) < 0:
+            raise OptionError(f"--{name}={getattr(options, name)}: a count; 0 follows the cores")
+    if options.stages and not options.make:
         raise OptionError("--stage names a stage of --make; add --make")
-    if args.shipped_scenarios and not args.make:
+    if options.shipped_scenarios and not options.make:
         raise OptionError("--shipped-scenarios is of --make; add --make")
-    if args.make:
-        if args.data:
+    if options.make:
+        if options.data:
             raise OptionError("--make makes its own data below --out; leave out --data")
         from lerobot_roborecover.study.make import make
 
         made = make(
-            args.name, args.out, args.stage, lambda line: print(line, flush=True),
-            shipped=args.shipped_scenarios,
+            options.name, options.out, options.stages, lambda line: print(line, flush=True),
+            shipped=options.shipped_scenarios,
         )  # fmt: skip
         if made is None:
             return 0
-    study = read_definition(args.out / "data" if args.make else args.data or shipped_study(args.name))
-    if args.print:
-        todo = list(
-            arms(study, args.out, scenario_ids(study, args.stride) if args.stride > 1 else (), args.slots)
-        )
-        for line in [*(a.run.command_line() for a in todo), report_command(study, todo, args.out)]:
+    given = options.out / "data" if options.make else options.data
+    study = read_definition(given or shipped_study(options.name))
+    if options.print:
+        ids = scenario_ids(study, options.stride) if options.stride > 1 else ()
+        todo = list(arms(study, options.out, ids, options.slots))
+        for line in [*(a.run.command_line() for a in todo), report_command(study, todo, options.out)]:
             print(line)
         return 0
-    if args.use_stored_outcomes:
+    if options.use_stored_outcomes:
         from lerobot_roborecover.study.stored import summary_tables, write_stored_logs
 
-        done = write_stored_logs(study, args.out / "stored")
+        done = write_stored_logs(study, options.out / "stored")
         print(summary_tables(study, done))
-        if not args.no_report:
-            print(f"report {write_report(study, done, args.out / 'stored').files.html}")
+        if not options.no_report:
+            print(f"report {write_report(study, done, options.out / 'stored').files.html}")
         return 0
     done = evaluate(
-        study, args.out, args.stride, args.slots, args.jobs, say=lambda line: print(line, flush=True)
-    )
-    write_outcomes(args.out / "outcomes.csv", outcomes_of(done))
+        study, options.out, options.stride, options.slots, options.jobs,
+        say=lambda line: print(line, flush=True),
+    )  # fmt: skip
+    write_outcomes(options.out / "outcomes.csv", outcomes_of(done))
     compared = compare_with_stored(study, done)
-    if not args.no_report:
-        print(write_report(study, done, args.out).text())
+    if not options.no_report:
+        print(write_report(study, done, options.out).text())
     if compared is None:
         print("no stored outcomes to compare with", file=sys.stderr)
         return 0

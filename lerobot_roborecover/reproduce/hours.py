@@ -14,15 +14,30 @@ class Costs:
     """Parameters of the estimate, none of them measured: put in those of `roborecover check policy`."""
 
     step_ms: float = 12.0
-    """Of a simulator, without picture. LIBERO's, on one core (docs/log/performance.md)."""
+    """For the expected hours alone.
+
+    Of a simulator's step, without picture. LIBERO's, on one core (docs/log/performance.md).
+    """
     picture_ms: float = 20.0
-    """Of all cameras, whenever the policy looks. A guess for two cameras on a GPU."""
+    """For the expected hours alone.
+
+    Of all cameras, whenever the policy looks. A guess for two cameras on a GPU.
+    """
     inference_ms: float = 100.0
-    """Of a batch. A guess for a model of 3 to 4 billion weights on a current GPU."""
+    """For the expected hours alone.
+
+    Of a batch. A guess for a model of 3 to 4 billion weights on a current GPU.
+    """
     slots: int = 16
-    """Simulators at once, each with a core."""
+    """For the expected hours alone.
+
+    Simulators at once, each with a core.
+    """
     batch: float = 8.0
-    """Observations in an inference, on average: half of the slots wait while the others step."""
+    """For the expected hours alone.
+
+    Observations in an inference, on average: half of the slots wait while the others step.
+    """
 
     def __post_init__(self):
         for name in ("step_ms", "picture_ms", "inference_ms"):
