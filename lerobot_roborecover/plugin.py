@@ -11,7 +11,7 @@ from types import TracebackType
 
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.evaluation import env_configs  # noqa: F401 - registers the env types
-from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.platforms.registry import ENV_PREFIX
 from lerobot_roborecover.policies import ema  # noqa: F401 - register types
 from lerobot_roborecover.policies.command_line import rewrite_env_argument
 from lerobot_roborecover.policies.detectors import register_detectors

@@ -23,7 +23,7 @@ from lerobot_roborecover.rollout import Pose, Reset, Rollout, Task
 HANDOFF_TOLERANCE_M = 0.002
 """Largest end-effector or object displacement of a faithful handoff (paper, "Replay-Based Data Checking")."""
 MAX_ID_CHARS = 200
-"""Of an id. File systems bear names of 255 bytes, and an id becomes a part of some: the longest are films,
+"""Of an id. File systems bear names of 255 bytes, and an id becomes a part of some: the longest are videos,
 `<id>_trial<number>_solved_by_prefix.mp4`, with 37 bytes beside the id at ten digits, and LeRobot's own folder
 of videos, `<group>_<id>`. The paper's release has ids of up to 146 characters."""
 ID_RULE = f"1 to {MAX_ID_CHARS} letters, digits, '.', '_' or '-' starting with a letter or digit"

@@ -20,7 +20,7 @@ from lerobot_roborecover.web.teleop.write import recordings_folder
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 
 OPERATOR = "scripted-operator"
-FILM_EVERY = 16
+FRAME_STRIDE = 16
 """Steps from one picture of the dataset to the next: software rendering is slow."""
 START_S = 300.0
 ATTEMPTS_FILE = "attempts.jsonl"

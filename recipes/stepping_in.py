@@ -170,7 +170,8 @@ class SteppingIn:
             "--env", "obs_type=state", "--env", self._snapshots(), *named, "--forks", forks,
             "--split", "train",
             "--select", f"id={'|'.join(self.parts['thresholds'])}", "--fit-split", "train",
-            "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA), "--films", "0",
+            "--fit-select", f"id={'|'.join(self.parts['forks'])}", "--alpha", str(ALPHA),
+            "--frame-strips", "0",
             "--num-workers", "2", "--work", self._watched, "--out", out,
         )  # fmt: skip
         return out / "detectors"

@@ -22,7 +22,7 @@ class LatencyRate:
     """One policy at one latency."""
 
     policy: str
-    meanwhile: str
+    during_inference: str
     """`hold` or `chunk`; empty with a frozen clock."""
     latency_s: float
     """0 with a frozen clock; NaN where it was measured."""
@@ -34,7 +34,7 @@ class LatencyRate:
 
 
 def latency_rates(rows: Iterable[TrialRow], level: float = LEVEL) -> list[LatencyRate]:
-    """Rates from recovery points, by policy, what went on meanwhile, and latency.
+    """Rates from recovery points, by policy, what is executed during inference, and latency.
 
     Args:
         rows: of one log or several.
@@ -67,17 +67,17 @@ def latency_rates(rows: Iterable[TrialRow], level: float = LEVEL) -> list[Latenc
 
 
 def _key(row: TrialRow) -> tuple[str, str, float]:
-    meanwhile, latency = row.options.get("realtime"), row.options.get("latency_s")
-    if not meanwhile:
+    during_inference, latency = row.options.get("realtime"), row.options.get("latency_s")
+    if not during_inference:
         return row.policy, "", 0.0
-    return row.policy, str(meanwhile), float(latency) if isinstance(latency, int | float) else MEASURED
+    return row.policy, str(during_inference), float(latency) if isinstance(latency, int | float) else MEASURED
 
 
 def _words(key: tuple[str, str, float]) -> str:
-    _, meanwhile, latency_s = key
-    if not meanwhile:
+    _, during_inference, latency_s = key
+    if not during_inference:
         return "a frozen clock"
-    return f"{'measured latency' if np.isnan(latency_s) else f'{latency_s:g} s'} ({meanwhile})"
+    return f"{'measured latency' if np.isnan(latency_s) else f'{latency_s:g} s'} ({during_inference})"
 
 
 def latency_table(rates: Sequence[LatencyRate], level: float = LEVEL) -> Table:
@@ -87,8 +87,18 @@ def latency_table(rates: Sequence[LatencyRate], level: float = LEVEL) -> Table:
         Column("Invalid", "count"), Column("RSR %", "percent"),
     )  # fmt: skip
     rows = tuple(
-        (r.policy, _words((r.policy, r.meanwhile, r.latency_s)), r.scenarios, r.trials, r.invalid, r.rate)
+        (
+            r.policy,
+            _words((r.policy, r.during_inference, r.latency_s)),
+            r.scenarios,
+            r.trials,
+            r.invalid,
+            r.rate,
+        )
         for r in rates
     )
-    notes = (f"Intervals: {100 * level:g} %. hold repeats the last action meanwhile, chunk goes on with it.",)
+    notes = (
+        f"Intervals: {100 * level:g} %. During an inference, hold repeats the last action and chunk goes on "
+        "with the last chunk.",
+    )
     return Table("latency", "RSR against latency", columns, rows, notes)

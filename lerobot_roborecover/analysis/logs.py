@@ -306,12 +306,12 @@ def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
 
 def clock_of(row: TrialRow) -> str:
     """How a trial's time went on while its policy thought, in words; empty where it stood still."""
-    meanwhile = row.options.get("realtime")
-    if not meanwhile:
+    during_inference = row.options.get("realtime")
+    if not during_inference:
         return ""
     latency = row.options.get("latency_s")
     what = f"{latency:g} s an inference" if isinstance(latency, int | float) else "inferences as measured"
-    return f"real time ({what}, {meanwhile})"
+    return f"real time ({what}, {during_inference})"
 
 
 def _unknown_weights(rows: Sequence[TrialRow]) -> list[str]:

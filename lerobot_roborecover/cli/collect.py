@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--perturb", action="store_true", help="add Uniform(-1, 1) to the translations of early actions")
     add("--perturb-steps", type=int, default=150, metavar="N", help="how many steps (%(default)s)")
     add(
-        "--scene-touched", type=float, default=0.0, metavar="MM",
+        "--min-displacement", type=float, default=0.0, metavar="MM",
         help="with --perturb: keep only rollouts in which an object ends at least so far from its path "
         "without disturbance, or tipped; runs each undisturbed, too",
     )  # fmt: skip
@@ -88,6 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--dry-run", action="store_true", help="list the rollouts, and run none")
     renamed(parser, "--frame-stride", "--film-every")
+    renamed(parser, "--min-displacement", "--scene-touched")
     renamed(parser, "--num-workers", "--slots")
 
 
@@ -139,7 +140,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
     from lerobot_roborecover.curation.collect.starts import parse_numbers
     from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.platforms import platform_named, platform_names
-    from lerobot_roborecover.platforms.base import ENV_PREFIX
+    from lerobot_roborecover.platforms.registry import env_type_of, platform_of
     from lerobot_roborecover.platforms.starts import Starts
 
     policy, kind, env, policy_options = "", "", [], []
@@ -148,7 +149,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         if name == "--policy.path":
             policy = value
         elif name == "--env.type":
-            kind = value.removeprefix("roborecover_")
+            kind = platform_of(value)
         elif name.startswith("--policy."):
             policy_options.append(word.removeprefix("--policy."))
         elif name.startswith("--env."):
@@ -156,7 +157,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         else:
             parser.error(f"unrecognized argument: {word}")
     if kind not in platform_names():
-        known = ", ".join(f"{ENV_PREFIX}{name}" for name in platform_names())
+        known = ", ".join(env_type_of(name) for name in platform_names())
         raise OptionError(f"--env.type={kind or 'none'}: give one of {known}")
     side = parse_side(args.frames)
     if not isinstance(args.rename_map, dict):
@@ -178,7 +179,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         device=args.device,
         perturb=args.perturb,
         perturbed_steps=args.perturb_steps,
-        judging=FilterConfig(tuple(args.no_exclude), tuple(args.exclude_only), args.scene_touched),
+        judging=FilterConfig(tuple(args.no_exclude), tuple(args.exclude_only), args.min_displacement),
         seed=args.seed,
         frames=side,
         workplace=workplace(args),
@@ -186,7 +187,7 @@ def options(parser: argparse.ArgumentParser, args: argparse.Namespace, rest: lis
         replicas=args.replicas,
         max_batch=args.max_batch,
         horizon=args.horizon,
-        film_every=args.frame_stride,
+        frame_stride=args.frame_stride,
         part_size=args.part_size,
         watchdog_s=args.watchdog,
         retry_errors=args.retry_errors,

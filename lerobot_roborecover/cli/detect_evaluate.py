@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--on-training-scenarios", action="store_true",
         help="compare also on scenarios that a monitor was trained on: says nothing about others",
     )  # fmt: skip
-    add("--seed", type=int, default=0, help="of the scenarios' halves in the film strips (%(default)s)")
+    add("--seed", type=int, default=0, help="of the scenarios' halves in the frame strips (%(default)s)")
     add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
 
 
@@ -79,7 +79,8 @@ def add_detector_arguments(parser: argparse._ActionsContainer, *, workers: str) 
         "--against", action="append", default=[], metavar="NAME",
         help="test pairs with this detector alone; may be given again (all pairs)",
     )  # fmt: skip
-    add("--films", type=int, default=3, help="trials shown as film strips; 0 renders none (%(default)s)")
+    add("--frame-strips", type=int, default=3, help="trials shown frame by frame; 0: none (%(default)s)")
+    renamed(parser, "--frame-strips", "--films")
     add("--work", type=Path, help="folder of trials and observations, kept between runs (OUT.work)")
     add(workers, dest="workers", type=int, default=1, help="processes that replay and render (%(default)s)")
     add(
@@ -128,7 +129,7 @@ def compare(args: argparse.Namespace) -> int:
         write_detection_report,
     )
     from lerobot_roborecover.detection.request import DetectionRequest, compare_detectors
-    from lerobot_roborecover.detection.strips import choose_trials, film_strips
+    from lerobot_roborecover.detection.strips import choose_trials, frame_strips
     from lerobot_roborecover.detection.trials import TrialSource
     from lerobot_roborecover.utils.outputs import check_page
     from lerobot_roborecover.utils.progress import Progress
@@ -163,7 +164,7 @@ def compare(args: argparse.Namespace) -> int:
         against=args.against,
     )
     found = compare_detectors(request, args.out, Progress("trial").of)
-    strips, problem = film_strips(found.trials, choose_trials(found.trials, args.films))
+    strips, problem = frame_strips(found.trials, choose_trials(found.trials, args.frame_strips))
     remarks = [*found.remarks, *([f"no pictures: {problem}"] if problem else [])]
     remarks += [f"left out {n}: {reason}" for reason, n in found.dropped.most_common()]
     about = {

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-HELP = "Show what a scenario dataset holds; replay one scenario to pictures, a film and a rerun recording."
+HELP = "Show what a scenario dataset holds; replay one scenario to pictures, a video and a rerun recording."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

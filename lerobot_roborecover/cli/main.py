@@ -135,7 +135,7 @@ def quiet(module: str) -> None:
         module: of the command. `study` trains with LeRobot's own commands, whose bars are the only progress
             there is.
     """
-    os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a film
+    os.environ.setdefault("SVT_LOG", "1")  # the video encoder: errors only, not a page a video
     if module != "study":
         os.environ.setdefault("TQDM_DISABLE", "1")
 

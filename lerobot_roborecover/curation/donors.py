@@ -295,13 +295,13 @@ def write_donors(
 
     def trajectories() -> Iterator[Trajectory]:
         jobs = [_job(donor, trial) for donor, trial in chosen]
-        films = zip(chosen, replayed(jobs, simulator, workers), strict=True)
-        for number, ((donor, trial), film) in enumerate(films, 1):
-            problem = _problem(film, trial)
+        replays = zip(chosen, replayed(jobs, simulator, workers), strict=True)
+        for number, ((donor, trial), replay) in enumerate(replays, 1):
+            problem = _problem(replay, trial)
             if problem:
                 dropped[problem] += 1
             else:
-                frames = [to_frame(platform, o) for o in film.observations]
+                frames = [to_frame(platform, o) for o in replay.observations]
                 yield _trajectory(donor, trial, frames)
             on_trajectory(number, len(chosen))
 
@@ -321,10 +321,10 @@ def _job(donor: Donor, trial: PolicyTrial) -> RenderJob:
     return RenderJob(donor.candidate.scenario, trial.actions, np.arange(t, t + len(trial.actions)))
 
 
-def _problem(film: RenderedSteps, trial: PolicyTrial) -> str:
-    if not film.succeeded:
+def _problem(replay: RenderedSteps, trial: PolicyTrial) -> str:
+    if not replay.succeeded:
         return "whose replay does not succeed"
-    if len(film.observations) != len(trial.actions):
+    if len(replay.observations) != len(trial.actions):
         return "whose replay ends early"
     return ""
 

@@ -45,7 +45,7 @@ class BlockingEncoder(StreamingVideoEncoder):
         self._put(video_key, np.array(image))
 
     def finish_episode(self) -> dict[str, tuple[Path, dict | None]]:
-        """Ends the films; waits as long as the encoder works, where LeRobot gives up after two minutes.
+        """Ends the videos; waits as long as the encoder works, where LeRobot gives up after two minutes.
 
         Raises:
             ScenarioError: the encoder has died.
@@ -101,7 +101,7 @@ def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int]) -> 
         steps: of all episodes, in that order.
 
     Raises:
-        ScenarioError: they do not fit together, or an episode's film has another number of frames than steps.
+        ScenarioError: they do not fit together, or an episode's video has not one frame a step.
     """
     from lerobot.datasets.aggregate import aggregate_datasets
 
@@ -120,7 +120,7 @@ def join_datasets(root: Path, sources: Sequence[Path], steps: Sequence[int]) -> 
 
 
 def quiet_video() -> None:
-    """Errors only from FFmpeg's libraries, which report on every film that they open or close."""
+    """Errors only from FFmpeg's libraries, which report on every video that they open or close."""
     import av
 
     av.logging.set_libav_level(av.logging.ERROR)
@@ -149,7 +149,7 @@ class EpisodeWriter:
         """Writes an episode.
 
         Raises:
-            ScenarioError: it has not one frame before each action, or a camera's film another number of
+            ScenarioError: it has not one frame before each action, or a camera's video another number of
                 frames than that; or its columns are not those of the first episode.
         """
         dataset, steps, written = self._dataset, len(episode.actions), 0
@@ -215,7 +215,7 @@ class EpisodeWriter:
         return dataset
 
     def _check_latest(self, meta: LeRobotDatasetMetadata, name: str, steps: int) -> None:
-        """The length of the film just written, which is where LeRobot begins the next one."""
+        """The length of the video just written, which is where LeRobot begins the next one."""
         latest = meta.latest_episode
         for camera in meta.video_keys:
             if latest is None:

@@ -1,4 +1,4 @@
-"""Looks at a scenario dataset: tables of the whole, and pictures, film and recording of one scenario."""
+"""Looks at a scenario dataset: tables of the whole, and pictures, video and recording of one scenario."""
 
 from __future__ import annotations
 
@@ -131,10 +131,10 @@ def write_scenario(
 
     record = _Recording(scenario, out / "replay.rrd") if recording else None
     out.mkdir(parents=True, exist_ok=True)
-    film = _Film(out / "prefix.mp4", round(simulator.control_hz))
+    video = _VideoWriter(out / "prefix.mp4", round(simulator.control_hz))
     try:
         for moment in replay_moments(simulator, scenario):
-            film.add(moment.picture)
+            video.add(moment.picture)
             if record:
                 record.add(moment)
             if frames:
@@ -145,7 +145,7 @@ def write_scenario(
             if moment.action is None:
                 Image.fromarray(moment.picture).save(out / "recovery.png")
     finally:
-        film.close()
+        video.close()
         if record:
             record.close()
     names = [
@@ -158,7 +158,7 @@ def write_scenario(
     return [out / name for name in names]
 
 
-class _Film:
+class _VideoWriter:
     """An MP4 file, written frame by frame."""
 
     def __init__(self, path: Path, fps: int):

@@ -44,7 +44,7 @@ class RenderedSteps:
     """(k,) of the task before each of the steps; NaN where the simulator does not tell."""
 
 
-def film(simulator: Simulator, job: RenderJob) -> RenderedSteps:
+def render_steps(simulator: Simulator, job: RenderJob) -> RenderedSteps:
     """Replays one trajectory to its end; renders only what is asked for."""
     wanted = set(job.steps.tolist())
     simulator.reset(job.scenario.task, job.scenario.reset)
@@ -58,7 +58,7 @@ def film(simulator: Simulator, job: RenderJob) -> RenderedSteps:
 
 
 def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int) -> Iterator[RenderedSteps]:
-    """Films of the jobs, in their order.
+    """Yields what each job renders, in their order.
 
     Args:
         jobs: of one platform.
@@ -69,13 +69,13 @@ def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int
     if workers <= 1:
         simulator = make_simulator(platform, **options)
         try:
-            yield from (film(simulator, job) for job in jobs)
+            yield from (render_steps(simulator, job) for job in jobs)
         finally:
             simulator.close()
         return
     with JobPool(platform, options, workers) as pool:
-        yield from pool.map_ordered(_film, jobs)
+        yield from pool.map_ordered(_render_steps, jobs)
 
 
-def _film(job: RenderJob) -> RenderedSteps:
-    return film(simulator_of_worker(), job)
+def _render_steps(job: RenderJob) -> RenderedSteps:
+    return render_steps(simulator_of_worker(), job)

@@ -155,7 +155,7 @@ def _frames_of(path: str, fps: float, size: int, mtime_ns: int, thorough: bool) 
                 raise ValueError("its video has no time base")
             if not thorough and stream.frames and stream.duration is not None:
                 places = float(stream.duration * base) * fps
-                # As many frames as the film is long, which `mp4` says of itself.
+                # As many frames as the video is long, which `mp4` says of itself.
                 if abs(places - stream.frames) < 0.01:
                     return True, np.array([stream.frames])
             times = [packet.pts for packet in container.demux(stream) if packet.pts is not None]

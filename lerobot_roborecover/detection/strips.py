@@ -1,4 +1,4 @@
-"""Pictures of trials, for the film strips of the page; rendered in worker processes."""
+"""Pictures of trials, for the frame strips of the page; rendered in worker processes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from lerobot_roborecover.analysis.figures.detection import FilmStrip
+from lerobot_roborecover.analysis.figures.detection import FrameStrip
 from lerobot_roborecover.detection.trials import ReplayedTrial
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.stepping import follow
@@ -33,7 +33,7 @@ def choose_trials(trials: Sequence[ReplayedTrial], count: int) -> list[int]:
     return turns[:count]
 
 
-def film_strips(trials: Sequence[ReplayedTrial], chosen: Sequence[int]) -> tuple[list[FilmStrip], str]:
+def frame_strips(trials: Sequence[ReplayedTrial], chosen: Sequence[int]) -> tuple[list[FrameStrip], str]:
     """Strips of the chosen trials; without pictures where they cannot be rendered, and why.
 
     Args:
@@ -43,7 +43,7 @@ def film_strips(trials: Sequence[ReplayedTrial], chosen: Sequence[int]) -> tuple
     if not chosen:
         return [], ""
     problem = ""
-    strips: dict[int, FilmStrip] = {}
+    strips: dict[int, FrameStrip] = {}
     options = platform_named(trials[chosen[0]].scenario.platform).picture_options(SIZE)
     with JobPool(trials[chosen[0]].scenario.platform, options, 1, limit_s=_TIMEOUT_S) as pool:
         outcomes = pool.outcomes(_pictures, list(chosen), lambda i: _arguments(trials[i]))
@@ -54,8 +54,8 @@ def film_strips(trials: Sequence[ReplayedTrial], chosen: Sequence[int]) -> tuple
             elif not problem:
                 why = outcome.words if isinstance(outcome, JobError) else outcome.message
                 problem = f"{trials[number].scenario.id}: {why}"
-            strips[number] = FilmStrip(number, _steps(trials[number]), tuple(pictures))
-    return [strips.get(i, FilmStrip(i, _steps(trials[i]), ())) for i in chosen], problem
+            strips[number] = FrameStrip(number, _steps(trials[number]), tuple(pictures))
+    return [strips.get(i, FrameStrip(i, _steps(trials[i]), ())) for i in chosen], problem
 
 
 def _steps(trial: ReplayedTrial) -> tuple[int, ...]:

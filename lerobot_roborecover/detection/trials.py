@@ -174,12 +174,12 @@ def look_at(
         jobs.append(RenderJob(scenario, trial.actions, np.arange(first + len(trial.actions)), first))
     done = len(trials) - len(todo)
     if jobs:
-        for i, film in zip(todo, replayed(jobs, options, source.workers), strict=True):
-            if film.succeeded != trials[i][1].row.success:
+        for i, replay in zip(todo, replayed(jobs, options, source.workers), strict=True):
+            if replay.succeeded != trials[i][1].row.success:
                 raise RuntimeError(
                     f"{trials[i][0].id}: its replay ends otherwise than the trial; the simulator is not exact"
                 )
-            _keep(files[i], film.observations, trials[i][0].task.instruction, env_batch)
+            _keep(files[i], replay.observations, trials[i][0].task.instruction, env_batch)
             done += 1
             progress(f"{what}: looking", done, len(trials))
     made = []

@@ -21,7 +21,8 @@ from lerobot_roborecover.evaluation.processors import choose_processors_in_scrip
 from lerobot_roborecover.evaluation.session import SimulatorSpec
 from lerobot_roborecover.evaluation.vector_env import ScenarioVectorEnv, create_recovery_envs
 from lerobot_roborecover.platforms import Platform, all_platforms, platform_named
-from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup
+from lerobot_roborecover.platforms.base import SimulatorSetup
+from lerobot_roborecover.platforms.registry import ENV_PREFIX, env_type_of
 from lerobot_roborecover.workers.messages import SlotConfig
 
 _LOG = logging.getLogger(__name__)
@@ -94,7 +95,11 @@ def _env_type(platform: Platform) -> type[RecoveryEnvConfig]:
     name = f"RoboRecover{platform.name.capitalize()}Env"
     members = {"__module__": __name__, "__doc__": base.__doc__, "platform_name": platform.name}
     made = dataclass(type(name, (RecoveryEnvConfig, base), members))
-    return EnvConfig.register_subclass(f"{ENV_PREFIX}{platform.name}")(made)
+    EnvConfig.register_subclass(env_type_of(platform.name))(
+        made
+    )  # the first is the type that it names itself
+    EnvConfig.register_subclass(f"{ENV_PREFIX}{platform.name}")(made)
+    return made
 
 
 def _register_all() -> tuple[dict[str, type[RecoveryEnvConfig]], dict[str, str]]:
@@ -111,7 +116,7 @@ def _register_all() -> tuple[dict[str, type[RecoveryEnvConfig]], dict[str, str]]
 
 
 ENV_TYPES, _UNUSABLE = _register_all()
-"""By platform's name: the env type `roborecover_<name>`."""
+"""By platform's name: its env type."""
 
 
 def env_type(platform: str) -> type[RecoveryEnvConfig]:
@@ -127,7 +132,7 @@ def env_type(platform: str) -> type[RecoveryEnvConfig]:
         if name in ENV_TYPES:
             return ENV_TYPES[name]
         raise OptionError(
-            f"--env.type={ENV_PREFIX}{name}: the platform's env config is not usable: "
+            f"--env.type={env_type_of(name)}: the platform's env config is not usable: "
             f"{_UNUSABLE.get(name, 'it was registered after the plugin was imported')}"
         )
     return ENV_TYPES[platform]

@@ -10,6 +10,7 @@ from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.envhub import HubScenarios
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.registry import env_type_of
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.outputs import check_page
 
@@ -53,7 +54,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         repo_id=repo_id,
         on_hub=bool(HUB_ID.fullmatch(offer.scenarios)),
         install=platform.install_command,
-        env_name=platform.env_name or platform.name,
+        env_type=env_type_of(platform.env_name or platform.name),
         **values,
     )
     texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}

@@ -24,9 +24,9 @@ def eval_info(
     Args:
         rows: of one protocol.
         group_by: `suite`, `cell` or `source`.
-        videos: films by scenario and trial.
+        videos: files by scenario and trial.
     """
-    films = videos or {}
+    files = videos or {}
     tasks: dict[tuple[str, str], list[TrialRow]] = defaultdict(list)
     for row in rows:
         tasks[group_name(row, group_by), row.scenario_id].append(row)
@@ -34,7 +34,7 @@ def eval_info(
     for (group, scenario_id), trials in sorted(tasks.items()):
         successes = [t.success for t in sorted(trials, key=lambda t: t.trial)]
         rewards = [float(s) for s in successes]
-        paths = [films[scenario_id, t.trial] for t in trials if (scenario_id, t.trial) in films]
+        paths = [files[scenario_id, t.trial] for t in trials if (scenario_id, t.trial) in files]
         metrics = {
             "sum_rewards": rewards,
             "max_rewards": rewards,

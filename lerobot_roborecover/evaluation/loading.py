@@ -17,7 +17,7 @@ from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import plain_parsing
-from lerobot_roborecover.policies.determinism import make_portable
+from lerobot_roborecover.policies.determinism import make_cross_cpu_deterministic
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.not_trained import NotTrained
@@ -40,8 +40,8 @@ class HostSpec:
     """Of the run."""
     max_batch: int = 64
     """Observations per inference, at most."""
-    portable: bool = False
-    """See `runner.RunnerOptions.portable`."""
+    cross_cpu_deterministic: bool = False
+    """See `runner.RunnerOptions.cross_cpu_deterministic`."""
 
 
 def policy_config(policy: str, options: Sequence[str] = (), device: str | None = None) -> PreTrainedConfig:
@@ -100,8 +100,8 @@ def _load_host(spec: HostSpec) -> PolicyRunner:
     policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
     _check_trained(spec.policy, policy)
     policy.eval()
-    if spec.portable:
-        make_portable(policy)
+    if spec.cross_cpu_deterministic:
+        make_cross_cpu_deterministic(policy)
     preprocessor, postprocessor = load_processors(policy.config, spec)
     env_pre, env_post = env_processors(spec.env, spec.policy)
     if isinstance(policy, ProvidesRunner):

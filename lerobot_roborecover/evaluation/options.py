@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.real_time import MEANWHILE
+from lerobot_roborecover.evaluation.real_time import DURING_INFERENCE
 from lerobot_roborecover.scenario import Start
+from lerobot_roborecover.utils.renamed_fields import move_old_fields
 
 __all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
 
@@ -64,9 +65,17 @@ class RecoveryOptions:
     """The simulator runs on while the policy thinks: an inference costs control steps, which count."""
     latency_s: float | None = None
     """Seconds that an inference is taken to last, with `realtime`; None charges what each has taken."""
-    meanwhile: str = "hold"
-    """What is executed while the policy thinks, with `realtime`: `hold` repeats the last action, `chunk`
+    during_inference: str = "hold"
+    """What is executed during an inference, with `realtime`: `hold` repeats the last action, `chunk`
     goes on with the last chunk."""
+    meanwhile: str | None = None
+    """Earlier name of `during_inference`."""
+
+    def __post_init__(self) -> None:
+        move_old_fields(self, "--env.", {"meanwhile": "during_inference"})
+        platforms_own = getattr(super(), "__post_init__", None)
+        if platforms_own is not None:
+            platforms_own()
 
     def check(self) -> None:
         """Checks what can be checked without scenarios.
@@ -86,12 +95,16 @@ class RecoveryOptions:
             raise OptionError(
                 f"--env.policy_watchdog_s={self.policy_watchdog_s}: seconds below a day; 0 waits for ever"
             )
-        if self.meanwhile not in MEANWHILE:
-            raise OptionError(f"--env.meanwhile={self.meanwhile}: not one of {list(MEANWHILE)}")
+        if self.during_inference not in DURING_INFERENCE:
+            raise OptionError(
+                f"--env.during_inference={self.during_inference}: not one of {list(DURING_INFERENCE)}"
+            )
         if self.latency_s is not None and not 0 <= self.latency_s <= 600:
             raise OptionError(f"--env.latency_s={self.latency_s}: seconds from 0 to 600")
-        if not self.realtime and (self.latency_s is not None or self.meanwhile != "hold"):
-            raise OptionError("--env.latency_s and --env.meanwhile are charged with --env.realtime=true only")
+        if not self.realtime and (self.latency_s is not None or self.during_inference != "hold"):
+            raise OptionError(
+                "--env.latency_s and --env.during_inference are charged with --env.realtime=true only"
+            )
         self.shard_of()
 
     def shard_of(self) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """Real-time evaluation: charges inference time in control steps.
 
 The paper's clock is frozen: the scene waits during an inference. With `--env.realtime=true` an inference of L
-seconds costs ceil(L x control rate) steps of the trial. `--env.meanwhile` selects what the robot does then:
+seconds costs ceil(L x control rate) steps of the trial. `--env.during_inference` selects what the robot does:
 
 - `hold`: it repeats the last action; the new chunk follows.
 - `chunk`: it continues the last chunk. The next inference starts before the chunk ends, as many steps as the
@@ -22,7 +22,7 @@ import numpy as np
 
 from lerobot_roborecover.errors import OptionError
 
-MEANWHILE = ("hold", "chunk")
+DURING_INFERENCE = ("hold", "chunk")
 _TINY = 1e-6
 """Tolerance in steps for rounding errors: 0.15 s at 20 steps a second must give three steps."""
 
@@ -31,7 +31,7 @@ _TINY = 1e-6
 class RealTime:
     """How inferences are charged in a run."""
 
-    meanwhile: str
+    during_inference: str
     """`hold` or `chunk`."""
     latency_s: float | None
     """Seconds of an inference; None takes what each has taken."""
@@ -41,7 +41,7 @@ class RealTime:
     def decisive(self) -> Mapping[str, object]:
         """Returns the settings for the trial row."""
         return {
-            "realtime": self.meanwhile,
+            "realtime": self.during_inference,
             "latency_s": "measured" if self.latency_s is None else self.latency_s,
         }
 
@@ -88,10 +88,10 @@ class LatencyModel:
         if not inferred:
             self._last = actions[-1]
             return actions
-        if rule.meanwhile == "chunk" and len(actions) < rule.horizon:
+        if rule.during_inference == "chunk" and len(actions) < rule.horizon:
             raise OptionError(
-                f"--env.meanwhile=chunk: this policy gives the {rule.horizon} actions of an inference one by "
-                "one, so that none is at hand while it thinks. Use --env.meanwhile=hold"
+                f"--env.during_inference=chunk: this policy gives the {rule.horizon} actions of an inference "
+                "one by one, so that none is at hand during the next. Use --env.during_inference=hold"
             )
         charged = rule.steps(seconds, self._hz)
         waited, fresh = actions[:0], actions
@@ -100,10 +100,10 @@ class LatencyModel:
             waited = left[:charged]
             held = waited[-1] if len(waited) else self._last
             waited = np.concatenate([waited, np.repeat(held[None], charged - len(waited), axis=0)])
-            if rule.meanwhile == "chunk":
+            if rule.during_inference == "chunk":
                 fresh = actions[min(charged, len(actions) - 1) :]
         keep = 0
-        if rule.meanwhile == "chunk":
+        if rule.during_inference == "chunk":
             keep = min(charged, len(fresh) if len(waited) else len(fresh) - 1)
         sent = np.concatenate([waited, fresh[: len(fresh) - keep]])
         self._left, self._last = fresh[len(fresh) - keep :], sent[-1]

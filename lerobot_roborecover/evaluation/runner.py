@@ -36,6 +36,7 @@ from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.policy_thread import CallStoppedError
 from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.renamed_fields import move_old_fields
 from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.backend import Backend
@@ -85,9 +86,14 @@ class RunnerOptions:
     retry: str = ""
     """Run trials of these outcomes again (`policy_error,timeout,sim_error`); their old rows are kept beside
     the trial log, in `<log>.retried.jsonl`."""
-    portable: bool = False
+    cross_cpu_deterministic: bool = False
     """Compute a diffusion policy's noise schedule in float64, so that its roots round alike on every
     processor; the last bit of its actions then differs from `lerobot-eval`'s."""
+    portable: bool | None = None
+    """Earlier name of `cross_cpu_deterministic`."""
+
+    def __post_init__(self) -> None:
+        move_old_fields(self, "--runner.", {"portable": "cross_cpu_deterministic"})
 
     @property
     def retried(self) -> list[str]:
@@ -199,13 +205,13 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
     if cfg.eval.recording:
         raise OptionError(
             "--eval.recording=true: roborecover eval records no dataset. Use lerobot-eval for that, or "
-            "--videos=N for films"
+            "--videos=N for videos"
         )
     out = cfg.folder
     facts = policy_metadata(
         policy,
         rename_map=cfg.rename_map,
-        portable=cfg.runner.portable,
+        cross_cpu_deterministic=cfg.runner.cross_cpu_deterministic,
         n_episodes=cfg.eval.n_episodes,
         output_dir=out,
     )
@@ -291,7 +297,12 @@ def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
     """The run's policy."""
     runner = cfg.runner
     return HostSpec(
-        cfg.given_policy, cfg.recovery_env, cfg.rename_map, cfg.seed, runner.max_batch, runner.portable
+        cfg.given_policy,
+        cfg.recovery_env,
+        cfg.rename_map,
+        cfg.seed,
+        runner.max_batch,
+        runner.cross_cpu_deterministic,
     )
 
 
@@ -308,29 +319,29 @@ def _places(cfg: RecoveryEvalConfig) -> EngineConfig:
     )
 
 
-def report(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, films: Sequence[Path]) -> None:
+def report(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, videos: Sequence[Path]) -> None:
     """Writes `eval_info.json` and prints the table.
 
     Args:
         cfg: the run's configuration.
         run: its log.
         scenarios: what was asked for.
-        films: videos that were kept.
+        videos: files that were kept.
     """
     wanted = {s.id for s in scenarios}
     rows = [r for r in run.rows() if r.scenario_id in wanted and r.trial < cfg.eval.n_episodes]
-    names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in films]
-    videos = {(m[1], int(m[2])): str(p) for m, p in names if m}
+    names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in videos]
+    by_trial = {(m[1], int(m[2])): str(p) for m, p in names if m}
     out = cfg.folder
     out.mkdir(parents=True, exist_ok=True)
-    info = eval_info(rows, cfg.recovery_env.group_by, videos)
+    info = eval_info(rows, cfg.recovery_env.group_by, by_trial)
     atomic_write(out / "eval_info.json", json.dumps(info, indent=2) + "\n")
     print(format_table(summarise([asdict(r) for r in rows])))
     if lack := missing(rows):
         print(f"\nincomplete: {lack.words}")
     print(f"\ntrial log {run.require_log().path}\neval info {out / 'eval_info.json'}")
-    if films:
-        print(f"videos {films[0].parent} ({len(films)})")
+    if videos:
+        print(f"videos {videos[0].parent} ({len(videos)})")
 
 
 def main(argv: Sequence[str]) -> int:

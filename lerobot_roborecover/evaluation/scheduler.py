@@ -168,8 +168,8 @@ class Engine:
         trial = self._run.trial(unit.scenario, unit.trial)
         worker.last = unit
         worker.active = ActiveTrial(worker, unit, trial, replica, trial.open_history(replica.host))
-        filmed = self._videos is not None and self._videos.wants(unit)
-        worker.slot.send("reset", trial.begin(filmed))
+        record_video = self._videos is not None and self._videos.wants(unit)
+        worker.slot.send("reset", trial.begin(record_video))
 
     def _ask(self, replica: Replica) -> bool:
         """Asks a free replica about the trials that wait for it, unless more company is to be expected."""

@@ -256,7 +256,7 @@ def _real_time(options: RecoveryOptions, facts: PolicyMetadata) -> RealTime | No
             "--env.realtime=true charges inferences, and nothing says how many actions one gives: name "
             "--policy.n_action_steps"
         )
-    return RealTime(options.meanwhile, options.latency_s, facts.execution_horizon)
+    return RealTime(options.during_inference, options.latency_s, facts.execution_horizon)
 
 
 def _load(options: RecoveryOptions, platform: str) -> ScenarioSet:

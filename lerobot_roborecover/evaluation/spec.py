@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.platforms.registry import env_type_of
 from lerobot_roborecover.utils.atomic_io import atomic_write
 
 
@@ -37,13 +37,13 @@ class RunSpec:
     rename_map: Mapping[str, str] = field(default_factory=dict)
     """The environment's observation keys to the policy's."""
     runner: Mapping[str, Any] = field(default_factory=dict)
-    """Of `runner.RunnerOptions`: `slots`, `max_batch`, `portable`, ..."""
+    """Of `runner.RunnerOptions`: `slots`, `max_batch`, `cross_cpu_deterministic`, ..."""
 
     def config(self) -> dict[str, Any]:
         """The configuration, in LeRobot's words; plain values only."""
         own = platform_named(self.platform)
         found = {
-            "env": {"type": f"{ENV_PREFIX}{own.env_name or own.name}", **own.env_defaults, **self.env},
+            "env": {"type": env_type_of(own.env_name or own.name), **own.env_defaults, **self.env},
             "policy": dict(self.policy),
             "eval": {"n_episodes": self.trials},
             "seed": self.seed,

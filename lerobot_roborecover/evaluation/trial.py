@@ -154,11 +154,11 @@ class Trial:
 
     # --- its life
 
-    def begin(self, filmed: bool = False) -> EpisodeSpec:
+    def begin(self, record_video: bool = False) -> EpisodeSpec:
         """Starts it: what a simulator needs for the handoff.
 
         Args:
-            filmed: replies are to bring a frame of every step.
+            record_video: replies are to bring a frame of every step.
         """
         self._leave(TrialState.NEW, to=TrialState.HANDING_OFF)
         return EpisodeSpec(
@@ -166,7 +166,7 @@ class Trial:
             self.protocol.start,
             self.protocol.rewind_for(self.scenario),
             self._check,
-            filmed,
+            record_video,
             self._rollback_steps,
         )
 

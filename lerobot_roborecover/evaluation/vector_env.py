@@ -308,10 +308,10 @@ def create_recovery_envs(
     Raises:
         OptionError, ScenarioError, TrialLogError: see `create_session`.
     """
-    if options.realtime and options.meanwhile == "chunk":
+    if options.realtime and options.during_inference == "chunk":
         raise OptionError(
-            "--env.meanwhile=chunk: LeRobot's loop hands actions over one by one, so that none is at hand "
-            "while the policy thinks. Use roborecover eval, or --env.meanwhile=hold"
+            "--env.during_inference=chunk: LeRobot's loop hands actions over one by one, so that none is at "
+            "hand during an inference. Use roborecover eval, or --env.during_inference=hold"
         )
     scenarios, run = create_session(options, spec, workers=workers, facts=facts)
     watch = None

@@ -17,7 +17,7 @@ KINDS = ("failures", "successes", "all")
 
 
 class VideoWriter:
-    """An MP4 that grows with its trial, so that no film is ever in memory.
+    """An MP4 that grows with its trial, so that no video is ever in memory.
 
     Args:
         path: where it is written while the trial runs.
@@ -42,25 +42,25 @@ class VideoWriter:
             self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
 
     def keep(self, path: Path) -> None:
-        """Ends the film and gives it its name."""
+        """Ends the video and gives it its name."""
         self._container.mux(self._stream.encode())
         self._container.close()
         os.replace(self.path, path)
 
     def drop(self) -> None:
-        """Throws the film away."""
+        """Throws the video away."""
         self._container.close()
         self.path.unlink(missing_ok=True)
 
 
 class VideoRecorder:
-    """Decides which trials are filmed and which films stay.
+    """Decides which trials are recorded and which videos stay.
 
-    A trial's outcome is known at its end only, so every trial that might be wanted is filmed until there are
-    enough; at most `count` films and one per slot under way are on disk.
+    A trial's outcome is known at its end only, so every trial that might be wanted is recorded until there
+    are enough; at most `count` videos and one per slot under way are on disk.
 
     Args:
-        folder: where films go; those already there count.
+        folder: where videos go; those already there count.
         count: how many to keep.
         of: `failures`, `successes`, `all`, or comma-separated scenario ids.
         ids: the run's scenarios.
@@ -93,7 +93,7 @@ class VideoRecorder:
         return recording
 
     def finish(self, recording: VideoWriter, unit: WorkItem, outcome: Outcome) -> None:
-        """Keeps or drops the film of a trial that has ended."""
+        """Keeps or drops the video of a trial that has ended."""
         success = outcome is Outcome.SUCCESS
         fits = self._of not in ("failures", "successes") or success == (self._of == "successes")
         if not fits or len(self.kept) >= self._count:

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from lerobot_roborecover.platforms.findings import Check
     from lerobot_roborecover.platforms.starts import Starts
 
-ENV_PREFIX = "roborecover_"
-"""Of the names under which LeRobot knows our env types."""
-
 type Driver = Callable[[int], np.ndarray]
 """Next action, (A,) float64, for the given step; reads the simulator's present state."""
 

@@ -8,6 +8,10 @@ from importlib.metadata import EntryPoint, entry_points
 ENTRY_POINTS = "roborecover.platforms"
 """Entry-point group: `name = "module:PLATFORM"`, an instance of `Platform`, or the class."""
 BUILT_IN = ("libero", "metaworld", "robotwin", "fake", "lerobot")
+ENV_PREFIX = "roborecover_"
+"""Of every env type."""
+_ENV_TYPES = {"lerobot": "wrapped"}
+"""Documented names of env types that are not the platform's; `roborecover_<platform>` works as well."""
 FAMILY_MEMBERS = ("lerobot_pusht", "lerobot_aloha")
 """Platforms of the `lerobot` family that are known without LeRobot: `lerobot_<env type>`."""
 
@@ -15,6 +19,21 @@ FAMILY_MEMBERS = ("lerobot_pusht", "lerobot_aloha")
 def platform_names() -> tuple[str, ...]:
     """All names: ours first, the known env types of LeRobot's, then those of other distributions."""
     return (*BUILT_IN, *FAMILY_MEMBERS, *registered())
+
+
+def env_type_of(name: str) -> str:
+    """Returns the env type of a platform, as it is documented: `roborecover_<name>` for most.
+
+    Args:
+        name: the platform's, or its `env_name`.
+    """
+    return ENV_PREFIX + _ENV_TYPES.get(name, name)
+
+
+def platform_of(env_type: str) -> str:
+    """Returns the platform's name that an env type stands for; takes documented and earlier names."""
+    name = env_type.removeprefix(ENV_PREFIX)
+    return next((platform for platform, documented in _ENV_TYPES.items() if documented == name), name)
 
 
 @cache

@@ -10,7 +10,7 @@ from draccus.utils import DecodingError, ParsingError
 from lerobot.configs import parser
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
-from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.platforms.registry import ENV_PREFIX
 from lerobot_roborecover.utils.plugins import register_plugins
 
 

@@ -16,7 +16,7 @@ _SCHEDULE = ("alphas_cumprod", "final_alpha_cumprod")
 """What diffusers' schedulers take roots of."""
 
 
-def make_portable(policy: torch.nn.Module) -> int:
+def make_cross_cpu_deterministic(policy: torch.nn.Module) -> int:
     """Keeps the noise schedules of a policy, and of the policies that it is made of, in float64.
 
     Its actions then differ from LeRobot's in the last bit, and are the same on every processor as far as

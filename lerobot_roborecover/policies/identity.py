@@ -120,14 +120,14 @@ def result_fields(config: Any) -> dict[str, Any]:
 
 
 def policy_settings(
-    config: Any, *, rename_map: Mapping[str, str] | None = None, portable: bool = False
+    config: Any, *, rename_map: Mapping[str, str] | None = None, cross_cpu_deterministic: bool = False
 ) -> dict[str, Any]:
     """Returns what differs from the checkpoint's own files, for `Protocol.policy_settings`.
 
     Args:
         config: the policy's configuration (a LeRobot `PreTrainedConfig`), its options applied.
         rename_map: the environment's observation keys to the policy's.
-        portable: whether the noise schedule is computed in float64.
+        cross_cpu_deterministic: whether the noise schedule is computed in float64.
     """
     found = _changed(config)
     device = getattr(config, "device", None)
@@ -137,8 +137,8 @@ def policy_settings(
         found |= config.trial_settings()
     if rename_map:
         found["rename_map"] = dict(sorted(rename_map.items()))
-    if portable:
-        found["portable"] = True
+    if cross_cpu_deterministic:
+        found["portable"] = True  # the name that stored rows have
     return _finite(found)
 
 

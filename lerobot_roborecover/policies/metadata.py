@@ -46,7 +46,7 @@ def policy_metadata(
     policy: str = "",
     identity: str = "",
     rename_map: Mapping[str, str] | None = None,
-    portable: bool = False,
+    cross_cpu_deterministic: bool = False,
     **others: Any,
 ) -> PolicyMetadata:
     """Facts of a run of a policy.
@@ -56,7 +56,7 @@ def policy_metadata(
         policy: its name in the rows; empty takes its identity.
         identity: of a policy that is not on disk (`object_identity`).
         rename_map: the environment's observation keys to the policy's.
-        portable: see `runner.RunnerOptions.portable`.
+        cross_cpu_deterministic: see `runner.RunnerOptions.cross_cpu_deterministic`.
         others: further fields of `PolicyMetadata`.
 
     Raises:
@@ -71,7 +71,7 @@ def policy_metadata(
     if path and not identity:
         name = policy_identity(path, getattr(config, "pretrained_revision", None))
     intervention = None
-    if kind == "remote":
+    if kind in ("roborecover_remote", "remote"):
         name = config.name or f"remote:{Path(config.mapping).stem}@{config.url}"
     elif kind == POLICY_TYPE:
         intervention = intervention_facts(config)
@@ -79,7 +79,7 @@ def policy_metadata(
         horizon = config.base.n_action_steps
         if horizon is None:
             horizon = saved_config(config.base.path, config.base.revision).get("n_action_steps")
-    settings = policy_settings(config, rename_map=rename_map, portable=portable)
+    settings = policy_settings(config, rename_map=rename_map, cross_cpu_deterministic=cross_cpu_deterministic)
     if policy and policy != name:
         settings[OBJECT] = name
     return PolicyMetadata(

@@ -23,7 +23,7 @@ from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_log
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.base import ENV_PREFIX
+from lerobot_roborecover.platforms.registry import platform_of
 from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
 from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
 from lerobot_roborecover.scenario import ScenarioError, Start
@@ -99,12 +99,13 @@ class ReproductionPlan:
         arguments = [*self.checkpoint.arguments, *self.arguments]
         apart = {f"--env.{name}" for name in _SET} | {"--policy.path", "--policy.mapping"}
         named = [(a.partition("=")[0], a) for a in arguments]
-        pace = {name for name, _ in named if name.startswith("--runner.")} - {"--runner.portable"}
-        given = [a for name, a in named if name not in apart | pace]
+        kept = "--runner.cross_cpu_deterministic", "--runner.portable"  # both names of one option
+        pace = {name for name, _ in named if name.startswith("--runner.")} - set(kept)
+        given = [a.replace(*kept) for name, a in named if name not in apart | pace]
         own = {name: self.option(f"policy.{name}") for name in ("path", "mapping")}
         env = {name: value for name, value in (config.get("env") or {}).items() if name not in _SET}
         return identity_of_run(
-            (self.option("env.type") or "").removeprefix(ENV_PREFIX),
+            platform_of(self.option("env.type") or ""),
             {**(config.get("policy") or {}), **own},
             start=start,
             arguments=given,
@@ -121,7 +122,7 @@ class ReproductionPlan:
             ScenarioError: they cannot be loaded.
         """
         found = {name: self.option(f"env.{name}") or "" for name in _SET}
-        kind = (self.option("env.type") or "").removeprefix(ENV_PREFIX)
+        kind = platform_of(self.option("env.type") or "")
         source, split = found["scenarios"], found["split"] or None
         own = platform_named(kind) if kind else None
         if own and own.default_scenarios:

@@ -90,6 +90,6 @@ def _arm(
         "trial_log": folder / "trials.jsonl",
     }
     # One observation a batch: an inference then rounds alike, whichever other trials wait.
-    runner = {"max_batch": 1, "portable": True, "slots": slots}
+    runner = {"max_batch": 1, "cross_cpu_deterministic": True, "slots": slots}
     run = RunSpec(study.platform, env, {**policy, "device": "cpu"}, trials, folder, runner=runner)
     return StudyArm(name, start, trials, run)

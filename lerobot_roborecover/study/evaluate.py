@@ -187,7 +187,8 @@ def _identity(arm: StudyArm) -> dict[str, Any]:
     """What all rows of an arm's log share: its policy's files and options, the env's options, and so on."""
     run = arm.run
     env = {k: v for k, v in run.env.items() if k not in ("scenarios", "split", "select", "trial_log")}
-    runner = {k: v for k, v in run.runner.items() if k != "slots"}
+    stored = {"cross_cpu_deterministic": "portable"}  # names in the identities of earlier runs
+    runner = {stored.get(k, k): v for k, v in run.runner.items() if k != "slots"}
     return identity_of_run(
         run.platform, run.policy, env=env, runner=runner, seed=run.seed, rename_map=dict(run.rename_map)
     )

@@ -92,7 +92,7 @@ class JobServer:
             return Done(work(*argument.arguments))
         except Exception as err:
             traceback.print_exc()
-            return JobError(_portable(err))
+            return JobError(_picklable(err))
 
     def close(self) -> None:
         """Closes the simulator."""
@@ -109,7 +109,7 @@ def simulator_of_worker() -> Simulator:
     return _server.simulator
 
 
-def _portable(error: Exception) -> Exception:
+def _picklable(error: Exception) -> Exception:
     try:
         return pickle.loads(pickle.dumps(error))
     except Exception:  # simulators and drivers raise types of their own, which may not even pickle

@@ -76,7 +76,7 @@ class EpisodeSpec:
     start: str
     rewind_steps: int
     handoff_check: bool
-    filmed: bool = False
+    record_video: bool = False
     """Whether replies to `reset` and `act` bring a frame of every step, for a video."""
     rollback_steps: int = 0
     """Most steps of a rollback: snapshots of as many steps are kept, where they are exact."""
@@ -94,7 +94,7 @@ class EpisodeStart:
     observation: dict[str, Any]
     handoff: Handoff
     frame: np.ndarray | None = None
-    """(H, W, 3) uint8, upright; where the trial is filmed."""
+    """(H, W, 3) uint8, upright; where the trial records a video."""
     hz: float = 0.0
     """Control steps per simulated second."""
     progress: float | None = None
@@ -127,7 +127,7 @@ class ActResult:
     seconds: float
     """Wall time of the simulator, observation included."""
     frames: tuple[np.ndarray, ...] = ()
-    """(H, W, 3) uint8 after each step, where the trial is filmed."""
+    """(H, W, 3) uint8 after each step, where the trial records a video."""
     attachment: bytes = b""
     """What the slot's server has made of a trial that is over, for the parent to keep: in a collection the
     rollout's record."""
@@ -151,7 +151,7 @@ class RollbackReply:
     solved: bool
     """Whether the task's predicate holds there already, which leaves nothing to recover from."""
     frame: np.ndarray | None = None
-    """(H, W, 3) uint8, where the trial is filmed."""
+    """(H, W, 3) uint8, where the trial records a video."""
     progress: float | None = None
     """As in `EpisodeStart`."""
 

@@ -30,7 +30,7 @@ class SlotServer:
         folder = Path(config.snapshot_dir) if config.snapshot_dir else None
         self._cache = SnapshotCache(folder=folder, approximate=config.approximate_snapshots)
         self._env: RecoveryEnv | None = None
-        self._filmed = False
+        self._record_video = False
 
     def answer(self, command: str, argument: Any = None) -> Any:
         """Runs one command: `spaces`, `reset`, `step`, `act`, `rollback`, `render`, `smoke`, `state` or
@@ -53,7 +53,7 @@ class SlotServer:
             return self._act(argument)
         if command == "rollback":
             result = self._env.rollback(argument)
-            return replace(result, frame=self._env.render().copy()) if self._filmed else result
+            return replace(result, frame=self._env.render().copy()) if self._record_video else result
         if command == "render":
             return self._env.render()
         if command == "state":
@@ -75,8 +75,8 @@ class SlotServer:
         )
         observation, _ = self._env.reset()
         assert self._env.handoff is not None
-        self._filmed = spec.filmed
-        frame = self._env.render() if spec.filmed else None
+        self._record_video = spec.record_video
+        frame = self._env.render() if spec.record_video else None
         hz = self._simulator.control_hz
         return EpisodeStart(observation, self._env.handoff, frame, hz, self._env.progress())
 
@@ -91,7 +91,7 @@ class SlotServer:
 
     def _act(self, actions: np.ndarray) -> ActResult:
         """Executes (n, A) actions, up to success or the horizon; renders at the end alone, and only if it
-        goes on. A filmed trial renders every step."""
+        goes on. A trial that records a video renders every step."""
         assert self._env is not None
         began = time.perf_counter()
         success = over = False
@@ -100,7 +100,7 @@ class SlotServer:
         for action in actions:
             success = self._env.advance(action)
             steps += 1
-            if self._filmed:
+            if self._record_video:
                 frames.append(self._env.render().copy())
             if (done := self._env.progress()) is not None:
                 progress.append(done)

@@ -1,7 +1,7 @@
 """An openpi policy server in one file: Python 3.9, numpy, msgpack and websockets 13 are all it needs.
 
 For policies that cannot live in one environment with LeRobot: run it, with a few lines around it, in theirs
-(`being_h05_libero.py` and its neighbours do), and ask it with `--policy.type=remote`.
+(`being_h05_libero.py` and its neighbours do), and ask it with `--policy.type=roborecover_remote`.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from lerobot_roborecover.web.teleop.client import Client
 from lerobot_roborecover.web.teleop.serve import TeleopConfig
 from lerobot_roborecover.web.teleop.starts import StartPoint, first_state
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
-from recipes.scripted_operator import FILM_EVERY, OPERATOR, Stop, Turn, drive
+from recipes.scripted_operator import FRAME_STRIDE, OPERATOR, Stop, Turn, drive
 from recipes.scripted_operator import record as record_turns
 
 STOP = Stop(30, 10)
@@ -181,7 +181,7 @@ def record(
                 state = init_states[(k + i) % len(init_states)]
                 starts.append(first_state("libero", task.name, task.suite, init_state=state))
     config = TeleopConfig(
-        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
+        out, "libero", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, frame_stride=FRAME_STRIDE,
         options={"render_quality": "fast"},
     )  # fmt: skip
     simulator = LiberoSimulator(obs_type="state")

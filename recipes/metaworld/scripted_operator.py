@@ -26,7 +26,7 @@ from lerobot_roborecover.web.teleop.serve import TeleopConfig
 from lerobot_roborecover.web.teleop.starts import StartPoint, first_state
 from recipes.deviations import DEVIATIONS, Deviation, Fumbled, Hand
 from recipes.metaworld.dataset import STUDY_TASKS
-from recipes.scripted_operator import FILM_EVERY, OPERATOR, Attempt, Stop, Turn, drive
+from recipes.scripted_operator import FRAME_STRIDE, OPERATOR, Attempt, Stop, Turn, drive
 from recipes.scripted_operator import record as record_turns
 
 STOP = Stop(56, 20)
@@ -165,7 +165,7 @@ def record(
                 start = first_state("metaworld", task, seed=seed)
                 starts.append(replace(start, task=replace(start.task, horizon=horizon)))
     config = TeleopConfig(
-        out, "metaworld", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, film_every=FILM_EVERY,
+        out, "metaworld", OPERATOR, starts, port=0, rate_hz=1000.0, size=size, frame_stride=FRAME_STRIDE,
         options={"render_quality": "fast"},
     )  # fmt: skip
 

@@ -17,11 +17,11 @@ from tests.support.trial_rows import policy_rows, trial_row, write_log
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "latency.py"
 
 
-def at(latency, rate, meanwhile="hold", policy="a"):
-    clock = {"realtime": meanwhile, "latency_s": latency} if meanwhile else {}
+def at(latency, rate, during_inference="hold", policy="a"):
+    clock = {"realtime": during_inference, "latency_s": latency} if during_inference else {}
     made = policy_rows(policy, 12, 2, rate, 1)
     options = {**made[0].options, **clock}
-    again = {"options": options, "config_hash": f"{policy}{latency}{meanwhile}"}
+    again = {"options": options, "config_hash": f"{policy}{latency}{during_inference}"}
     return [trial_row(r.scenario_id, r.trial, r.success, policy=policy, **again) for r in made]
 
 
@@ -30,7 +30,7 @@ ROWS = [*at(0.0, 0.7, ""), *at(0.2, 0.4), *at(0.1, 0.6), *at("measured", 0.5), *
 
 def test_rates_by_latency():
     rates = latency_rates(ROWS)
-    known = [(r.meanwhile, r.latency_s) for r in rates]
+    known = [(r.during_inference, r.latency_s) for r in rates]
     assert known[:-1] == [("", 0.0), ("chunk", 0.1), ("hold", 0.1), ("hold", 0.2)]
     assert known[-1][0] == "hold"
     assert known[-1][1] != known[-1][1], "a measured latency is no number"

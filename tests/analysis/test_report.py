@@ -357,7 +357,7 @@ def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     evaluate(data, runs / "trials.jsonl", trials=2, batch=2, start="initial")
     video = tmp_path / "videos" / "toy_fake-push-left-000"
     video.mkdir(parents=True)
-    (video / "eval_episode_0.mp4").write_bytes(b"film")
+    (video / "eval_episode_0.mp4").write_bytes(b"video")
     out = tmp_path / "out"
     options = ["--draws=200", f"--scenarios={data}", f"--videos=push={tmp_path / 'videos'}"]
     assert main(["report", str(runs), f"--out={out}", *options]) == 0

@@ -19,14 +19,14 @@ OLD = {
     "merge": "--unequal=--allow-unequal-trials",
     "study": "--every=--stride --stored=--use-stored-outcomes",
     "dataset render": "--workers=--num-workers",
-    "curate collect": "--film-every=--frame-stride --slots=--num-workers",
+    "curate collect": "--film-every=--frame-stride --scene-touched=--min-displacement --slots=--num-workers",
     "curate screen": "--curtail=--early-stop --slots=--num-workers",
     "curate validate": "--workers=--num-workers",
     "curate split": "--apart=--disjoint-by --least=--min-per-split",
     "curate donors": "--base-below=--max-base-rate --donor-above=--min-donor-rate --workers=--num-workers",
     "curate training-data": "--of=--outcome --workers=--num-workers",
     "detect data": "--every=--stride --workers=--num-workers",
-    "detect evaluate": "--workers=--num-workers",
+    "detect evaluate": "--workers=--num-workers --films=--frame-strips",
     "detect fork": "--of=--outcome --at=--steps --every=--stride --slots=--num-workers",
 }
 """By command: options of the last release that are called otherwise now, and how."""

@@ -225,6 +225,6 @@ def test_libero_render_gives_a_training_ready_dataset(tmp_path, true_state):
         "observation.images.image": (5, 64, 64, 3),
         "observation.images.image2": (5, 64, 64, 3),
     }
-    # The film is lossy; upside down, or of another step, it would differ by far more.
-    film = dataset[11]["observation.images.image"].numpy().transpose(1, 2, 0) * 255
-    assert np.abs(film - kept["observation.images.image"][-2]).mean() < 6
+    # The video is lossy; upside down, or of another step, it would differ by far more.
+    video = dataset[11]["observation.images.image"].numpy().transpose(1, 2, 0) * 255
+    assert np.abs(video - kept["observation.images.image"][-2]).mean() < 6

@@ -191,7 +191,7 @@ def test_what_runs_again(stand_in):
     seed = changed(build.content, "split.seed", 7)
     assert build(content=seed) == ["split", "render"]
     assert build.asked["split"][1].seed == 7
-    assert build(content=changed(seed, "screen.slots", 9)) == [], "a pace is no change"
+    assert build(content=changed(seed, "screen.num_workers", 9)) == [], "a pace is no change"
     for key, value in (("screen.engine", "local"), ("validate.ray_address", "head:6379")):
         assert build(content=changed(seed, key, value)) == [], "nor is a place"
     assert build(content=changed(seed, "screen.keep", [2, 18])) == ["screen", "validate", "split", "render"]
@@ -378,7 +378,7 @@ def whole_build(build, capsys) -> list:
 def test_from_rollouts_to_episodes(build, capsys):
     whole_build(build, capsys)
     # Nothing has changed, nothing runs; a faster pace is no change.
-    assert build(content=changed(build.whole, "validate.workers", 1)) == 0
+    assert build(content=changed(build.whole, "validate.num_workers", 1)) == 0
     assert ran(capsys.readouterr().out) == []
 
 

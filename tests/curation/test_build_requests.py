@@ -12,8 +12,9 @@ from lerobot_roborecover.cli import agree, collect, publish, render, screen, spl
 from lerobot_roborecover.cli.main import command_parser
 from lerobot_roborecover.cli.tree import find_call
 from lerobot_roborecover.curation.pipeline import requests
-from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
+from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, ChainConfig, read_config
 from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.errors import OptionError
 from tests.curation.test_build import write
 
 pytestmark = pytest.mark.lerobot
@@ -30,9 +31,9 @@ MOST = {
         "one": {
             "expert": "expert_biased", "name": "me", "task": ["push-*", "a b"], "seeds": "0-4", "seed": 11,
             "reset_seed": 12, "trials": 2, "horizon": 99, "perturb": True, "perturb_steps": 5,
-            "scene_touched": 2.5, "frames": 32, "film_every": 2, "no_exclude": ["a"],
+            "min_displacement": 2.5, "frames": 32, "frame_stride": 2, "no_exclude": ["a"],
             "exclude_only": ["b", "c"], "engine": "ray", "ray_address": "head:6379", "replicas": 2,
-            "slots": 3, "max_batch": 2, "device": "cpu", "watchdog": 33,
+            "num_workers": 3, "max_batch": 2, "device": "cpu", "watchdog": 33,
             "retry_errors": True, "env": {"obs_type": "state", "flag": True, "list": [1, 2]},
             "rename_map": {"a": "b"},
         },
@@ -44,16 +45,16 @@ MOST = {
              "env": {"obs_type": "state"}, "rename_map": {"c": "d"}},
             {"path": "lab/other"},
         ],
-        "trials": 3, "keep": [2, 4], "max_invalid": 2, "run_seed": 5, "device": "cuda", "slots": 7,
+        "trials": 3, "keep": [2, 4], "max_invalid": 2, "run_seed": 5, "device": "cuda", "num_workers": 7,
         "engine": "ray", "ray_address": "head:6379", "replicas": 2, "max_batch": 3,
         "env": {"watchdog_s": 1.5},
     },
     "validate": {
         "runs": 2, "seed": 3, "tolerance_mm": 1.5, "min_ssim": 0.5, "no_frames": True, "no_outcomes": True,
-        "engine": "ray", "ray_address": "head:6379", "workers": 3, "limit_s": 10, "env": {"a": "b"},
+        "engine": "ray", "ray_address": "head:6379", "num_workers": 3, "limit_s": 10, "env": {"a": "b"},
     },
-    "split": {"sizes": {"train": 10, "test": 5}, "seed": 4, "apart": "trajectory,record"},
-    "render": {"frames": 128, "workers": 3, "env": {"q": "fast"}},
+    "split": {"sizes": {"train": 10, "test": 5}, "seed": 4, "disjoint_by": "trajectory,record"},
+    "render": {"frames": 128, "num_workers": 3, "env": {"q": "fast"}},
     "publish": {
         "repo_id": "org/name", "version": "2.0.0", "private": True, "title": "A title", "no_pictures": True,
         "anonymise": True,
@@ -73,23 +74,23 @@ COMMANDS = {
     "most": {
         "collect": "--env.type=roborecover_fake --expert expert_biased --name me --task push-* --task a%b "
         "--seeds 0-4 --seed 11 --reset-seed 12 --trials 2 --horizon 99 --perturb --perturb-steps 5 "
-        "--scene-touched 2.5 --frames 32 --film-every 2 --no-exclude a --exclude-only b --exclude-only c "
-        "--engine ray --ray-address head:6379 --replicas 2 "
-        "--slots 3 --max-batch 2 --device cpu --watchdog 33 --retry-errors --env.flag=true "
+        "--min-displacement 2.5 --frames 32 --frame-stride 2 --no-exclude a --exclude-only b "
+        "--exclude-only c --engine ray --ray-address head:6379 --replicas 2 "
+        "--num-workers 3 --max-batch 2 --device cpu --watchdog 33 --retry-errors --env.flag=true "
         '--env.list=[1,%2] --env.obs_type=state --rename_map {"a":"b"} --license mit --out out/collect/one',
         "agree": "out/candidates --votes votes --votes-needed 2 --tolerance 4 --no-consensus drop "
         "--license mit --out out/scenarios",
         "screen": "out/scenarios --policy act=lab/act --policy lab/other --deterministic act "
         "--policy-option act:k=1 --policy-option act:l=[1] --env act:obs_type=state --env watchdog_s=1.5 "
         '--rename-map act:{"c":"d"} --trials 3 --keep 2 4 --max-invalid 2 --run-seed 5 --device cuda '
-        "--engine ray --ray-address head:6379 --replicas 2 --slots 7 --max-batch 3 --out out/screened",
+        "--engine ray --ray-address head:6379 --replicas 2 --num-workers 7 --max-batch 3 --out out/screened",
         "validate": "out/screened --trials-folder out/screened.trials --candidates out/candidates --runs 2 "
         "--seed 3 --tolerance-mm 1.5 --min-ssim 0.5 --no-frames --no-outcomes --engine ray "
-        "--ray-address head:6379 --workers 3 --limit-s 10 "
+        "--ray-address head:6379 --num-workers 3 --limit-s 10 "
         "--env a=b --out out/validated",
-        "split": "out/validated --split train=10 --split test=5 --seed 4 --apart trajectory,record "
+        "split": "out/validated --split train=10 --split test=5 --seed 4 --disjoint-by trajectory,record "
         "--out out/split",
-        "render": "out/split --frames 128 --workers 3 --env q=fast --out out/rendered",
+        "render": "out/split --frames 128 --num-workers 3 --env q=fast --out out/rendered",
         "publish": "out/rendered --repo-id org/name --version 2.0.0 --private --title A%title --no-pictures "
         "--anonymise",
     },
@@ -143,6 +144,24 @@ def test_a_file_and_its_commands_ask_for_the_same(tmp_path, name, content):
     assert config.publish is not None
     publishing = requests.publish_request(config.publish, places)
     same(publishing, publish.request(parsed("publish", told["publish"])))
+
+
+def test_earlier_keys_ask_for_the_same(tmp_path, capsys):
+    earlier = {new: old for old, new in OLD_KEYS.items() if old != "slots"}
+    content = MOST | {"screen": {**MOST["screen"], "early_stop": True}}
+
+    def older(value):
+        if not isinstance(value, dict):
+            return value
+        return {earlier.get(k, k): older(v) for k, v in value.items()}
+
+    assert one(older(content), tmp_path)[0] == one(content, tmp_path)[0]
+    said = capsys.readouterr().err
+    assert "note: collect.one.film_every is now collect.one.frame_stride\n" in said
+    assert "note: screen.curtail is now screen.early_stop\n" in said
+    render = {"workers": 1, "num_workers": 2}
+    with pytest.raises(OptionError, match=r"render\.workers is the earlier name of render\.num_workers"):
+        one(MOST | {"render": render}, tmp_path)
 
 
 def test_a_zero_is_not_left_out(tmp_path):

@@ -82,7 +82,7 @@ def problems(tmp_path, policy):
         ("validate.engine", "foo", "validate: --engine=foo"),
         ("validate.rejects", "nowhere.txt", "validate: rejects nowhere.txt is not there"),
         ("split.sizes", {"train": 0.5, "test": 0.6}, "split: fractions"),
-        ("split.apart", "colour", "split: "),
+        ("split.disjoint_by", "colour", "split: "),
         ("render.frames", 33, "render: frames 33"),
         ("render.env", {"nothing": 1}, "render: unrecognized arguments: --nothing=1"),
         ("publish", {"repo_id": "no slash"}, "publish: repo_id 'no slash' is not like ORG/NAME"),
@@ -130,12 +130,12 @@ def test_weights_that_were_cut_off_are_found(problems, tmp_path):
 
 @pytest.mark.lerobot
 def test_a_curtailed_screening_leaves_enough_to_validate_with(problems):
-    screen = {**problems.good["screen"], "curtail": True}
+    screen = {**problems.good["screen"], "early_stop": True}
     found = problems("screen", screen)
-    assert not any("curtail" in line for line in found)
+    assert not any("early_stop" in line for line in found)
     problems.good["validate"] = {**problems.good.get("validate", {}), "runs": 4}
-    (line,) = [line for line in problems("screen", screen) if "curtail" in line]
-    assert line.startswith("validate: runs 4: with screen.curtail a scenario may have only 3 trials")
+    (line,) = [line for line in problems("screen", screen) if "early_stop" in line]
+    assert line.startswith("validate: runs 4: with screen.early_stop a scenario may have only 3 trials")
 
 
 @pytest.mark.lerobot

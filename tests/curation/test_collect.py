@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.collect.record import (
     record_path,
 )
 from lerobot_roborecover.curation.collect.rollouts import RolloutJournal, RolloutOutcome, run_expert
-from lerobot_roborecover.curation.collect.server import SERVER, CollectServer, FilmJob
+from lerobot_roborecover.curation.collect.server import SERVER, CollectServer, VideoJob
 from lerobot_roborecover.curation.collect.starts import make_units, parse_numbers
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.fake import PLATFORM as FAKE
@@ -58,7 +58,7 @@ def ask(server, command, argument):
 
 def drive(server, folder, planned):
     """A rollout to its end, its record kept as the book does."""
-    ended = ask(server, "drive", planned)
+    ended = ask(server, "roll_out", planned)
     atomic_write(record_path(folder, planned.record_name), ended.record)
     return ended
 
@@ -217,21 +217,21 @@ def test_reach_decides_at_the_walls():
     assert simulator.reachable(np.array([-1.0, 0.0]))
 
 
-def test_a_film_is_compared_with_the_rollout(tmp_path):
+def test_a_replay_is_compared_with_the_rollout(tmp_path):
     server = CollectServer(config())
     scenario = units((0,))[0]
     drive(server, tmp_path, scenario)
     record = read_record(record_path(tmp_path, scenario.id))
     poses = np.stack(list(record.steps.bodies.values()))
-    job = FilmJob(Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses)
+    job = VideoJob(Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses)
     plain = CollectServer(SlotConfig("fake", {}, server=SERVER))
-    film = ask(plain, "film", job)
-    assert film.error_m == 0.0
-    assert len(film.observations) == len(record.actions)
-    assert np.array_equal(film.observations[-1]["agent_pos"][:2], record.steps.bodies["eef"][-2, :2])
+    rendered = ask(plain, "render", job)
+    assert rendered.error_m == 0.0
+    assert len(rendered.observations) == len(record.actions)
+    assert np.array_equal(rendered.observations[-1]["agent_pos"][:2], record.steps.bodies["eef"][-2, :2])
     shifted = poses.copy()
     shifted[0, 7, 1] += 0.01
-    assert ask(plain, "film", replace(job, poses=shifted)).error_m == pytest.approx(0.01)
+    assert ask(plain, "render", replace(job, poses=shifted)).error_m == pytest.approx(0.01)
 
 
 def test_damaged_records_say_so(tmp_path):

@@ -69,7 +69,7 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
     note = lambda root, *a, **k: written.append(root) or original(root, *a, **k)  # noqa: E731
     monkeypatch.setattr(collect_write, "write_candidates", note)
     assert main(arguments(tmp_path / "two", *perturbed, "--slots=1")) == 0
-    assert len(set(written)) == len(written)  # a part that was there is not filmed again
+    assert len(set(written)) == len(written)  # a part that was there is not rendered again
     assert meaning(tmp_path / "one") == meaning(tmp_path / "two")
 
     # It is finished, and another one is refused with what differs.
@@ -80,7 +80,7 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
     shared = f"--work={tmp_path / 'one.work'}"
     assert main(arguments(tmp_path / "three", *perturbed, shared, "--seed=8")) == 2
     assert "holds rollouts with other options (seed 7, now 8)" in capsys.readouterr().err
-    touched = [*perturbed, shared, "--scene-touched=15", "--frames=32", "--slots=1"]
+    touched = [*perturbed, shared, "--min-displacement=15", "--frames=32", "--slots=1"]
     assert main(arguments(tmp_path / "touched", *touched)) in (0, 1)
     assert "the disturbance did not touch the scene" in capsys.readouterr().out
     # Only what failed is run again without the disturbance: what succeeded is dropped anyway.
@@ -127,7 +127,7 @@ def test_a_policy_collects_the_same_whatever_the_slots(tmp_path, capsys):
         (["--expert=expert", "--init-states=0"], "no stored init states"),
         (["--expert=expert", "--seeds=0", "--task=push-lefd"], "push-left"),
         (["--expert=expert", "--seeds=0", "--frames=9"], "16 to 2048"),
-        (["--expert=expert", "--seeds=0", "--scene-touched=5"], "--perturb"),
+        (["--expert=expert", "--seeds=0", "--min-displacement=5"], "--perturb"),
         (["--expert=expert", "--seeds=0", "--no-exclude=jerk"], "erratic"),
         (["--expert=expert", "--seeds=0", "--env.control=3"], "control"),
         (["--policy.path=/nowhere", "--seeds=0"], "/nowhere"),
@@ -157,7 +157,7 @@ def test_something_else_in_the_folder_is_left_alone(tmp_path, capsys):
 
 @pytest.mark.metaworld
 def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
-    from lerobot_roborecover.curation.collect.server import CollectServer, FilmJob
+    from lerobot_roborecover.curation.collect.server import CollectServer, VideoJob
     from lerobot_roborecover.curation.collect.starts import make_units
     from lerobot_roborecover.platforms import platform_named
     from lerobot_roborecover.platforms.names import choose_tasks
@@ -169,7 +169,7 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
     made = make_units(tasks, Starts(seeds=(0,)), "expert_biased", np.zeros(4), perturbed=True)
     settings = {"seed": 7, "expert": "expert_biased"}
     server = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}, settings=settings))
-    film = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}))
+    renderer = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}))
     flags = set()
     for scenario in made:
         ended = drive(server, tmp_path, scenario)
@@ -177,8 +177,10 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
         assert len(record.actions) == ended.steps
         flags |= set(record.steps.perturbation[:150].tolist())
         poses = np.stack(list(record.steps.bodies.values()))
-        job = FilmJob(Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses)
-        assert ask(film, "film", job).error_m == 0.0
+        job = VideoJob(
+            Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses
+        )
+        assert ask(renderer, "render", job).error_m == 0.0
         box = record.workspace
         inside = record.actions[record.steps.perturbation == PERTURBED]
         assert len(inside)

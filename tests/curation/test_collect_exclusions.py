@@ -8,7 +8,7 @@ import pytest
 from lerobot_roborecover.curation.collect import exclusions as rules
 from lerobot_roborecover.curation.collect.judge import (
     TOUCHED_TILT_DEG,
-    scene_touched,
+    scene_disturbance,
 )
 from lerobot_roborecover.curation.collect.record import (
     Record,
@@ -135,18 +135,18 @@ def test_touched_is_what_ends_off_its_undisturbed_path():
     carried[100:, 0] = np.linspace(0, 0.3, 102)
     twin = record_of(line(), puck=carried)
     left = np.zeros((202, 3))  # missed: where it was, which the twin's path begins with
-    assert scene_touched(record_of(line(), puck=left), twin).displaced_mm == 0
+    assert scene_disturbance(record_of(line(), puck=left), twin).displaced_mm == 0
     let_go = carried.copy()
     let_go[150:] = [carried[150, 0], 0.0, 0.0]  # somewhere on its path
-    assert scene_touched(record_of(line(), puck=let_go), twin).displaced_mm == 0
+    assert scene_disturbance(record_of(line(), puck=let_go), twin).displaced_mm == 0
     aside = carried.copy()
     aside[150:] = [carried[150, 0], 0.04, 0.0]
-    touch = scene_touched(record_of(line(), puck=aside), twin)
+    touch = scene_disturbance(record_of(line(), puck=aside), twin)
     assert (touch.body, touch.displaced_mm) == ("puck", pytest.approx(40))
     tipped = record_of(line(), puck=left)
     angle = np.radians(TOUCHED_TILT_DEG + 5)
     tipped.steps.bodies["puck"][-1, 3:] = [np.sin(angle / 2), 0, 0, np.cos(angle / 2)]
-    assert scene_touched(tipped, twin).tilted_deg == pytest.approx(TOUCHED_TILT_DEG + 5)
+    assert scene_disturbance(tipped, twin).tilted_deg == pytest.approx(TOUCHED_TILT_DEG + 5)
 
 
 def test_settings_are_plain_values():

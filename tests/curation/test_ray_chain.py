@@ -114,7 +114,7 @@ def test_a_policys_rollouts(cluster, run, monkeypatch, tmp_path):
         "--env.obs_type=state",
         "--device=cpu",
     ]
-    asked += [f"--env.{SLOW}", "--perturb", "--scene-touched=1"]
+    asked += [f"--env.{SLOW}", "--perturb", "--min-displacement=1"]
     assert run(*arguments(tmp_path / "here", *asked)) in (0, 1)
     with node_dies(cluster, monkeypatch, RolloutJournal, "add", after=3):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=3")) in (0, 1)

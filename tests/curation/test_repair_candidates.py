@@ -49,7 +49,7 @@ def source(tmp_path_factory):
         [
             Decision("ep-0002", "annotate", "kept"),
             Decision("ep-0003", "annotate", "dropped", "no consensus"),
-            Decision("never-filmed", "collect", "dropped", "solved"),
+            Decision("never-rendered", "collect", "dropped", "solved"),
         ],
     )
     cast(root, "ann", vote("ann", 2, 11), vote("ann", 3, 12), vote("ann", 2, 13))
@@ -98,7 +98,7 @@ def test_everything_that_goes_by_candidate_is_brought_into_agreement(source, tmp
         for name, poses in original.steps(old).bodies.items():
             np.testing.assert_array_equal(found.steps(episode).bodies[name], poses)
     decided = read_decisions(root)
-    assert {d.candidate for d in decided} == {"ep-0002", "ep-0003", "never-filmed"}
+    assert {d.candidate for d in decided} == {"ep-0002", "ep-0003", "never-rendered"}
     assert decided == [d for d in read_decisions(source) if d.candidate in {d.candidate for d in decided}]
     assert [(r.stage, r.entered, r.kept) for r in count_stages(decided)] == [
         ("collect", 3, 2),

@@ -54,7 +54,8 @@ PROGRAM = """
 
     observations = [observation() for _ in range(6)]
     env = env_config("libero", "libero_recovery", ["--obs_type=state"])
-    host = load_host(HostSpec(policy_config(sys.argv[1], (), "cpu"), env, max_batch=1, portable=True))
+    policy = policy_config(sys.argv[1], (), "cpu")
+    host = load_host(HostSpec(policy, env, max_batch=1, cross_cpu_deterministic=True))
     print(torch.backends.cpu.get_cpu_capability())
     for threads in (1, 2, 4):
         torch.set_num_threads(threads)

@@ -21,7 +21,7 @@ from lerobot_roborecover.platforms.stepping import iter_steps
 from tests.support.trial_rows import trial_row
 
 SIDE, STEPS, POINT = 96, 40, 25
-FILM = {
+RENDERING = {
     "obs_type": "pixels_agent_pos",
     "observation_height": SIDE,
     "observation_width": SIDE,
@@ -52,7 +52,7 @@ def recording(simulator, index: int, every: int, spoilt: bool) -> Recording:
         Candidate(f"c{index}", "natural"),
         Trajectory(
             known.task, "noise", made.rollout.actions, frames, False, reset=made.rollout.reset,
-            provenance={"collect": {"film": {"every": every, "options": FILM}}},
+            provenance={"collect": {"film": {"every": every, "options": RENDERING}}},
         ),
         made.steps,
     )  # fmt: skip
@@ -63,7 +63,7 @@ def recording(simulator, index: int, every: int, spoilt: bool) -> Recording:
 @pytest.mark.lerobot
 @pytest.mark.nightly
 def test_frames_of_the_video(tmp_path):
-    simulator = make_simulator("metaworld", **FILM)
+    simulator = make_simulator("metaworld", **RENDERING)
     recordings = (recording(simulator, i, 1 + i % 2, spoilt=i == 2) for i in range(3))
     write_candidates(tmp_path / "rollouts", recordings, fps=80, versions=simulator.fingerprint())
     candidates = read_candidates(tmp_path / "rollouts")

@@ -67,12 +67,12 @@ def test_ids_of_the_real_form_are_ids_of_everything(folder, suite, task, episode
 def test_a_long_id_is_a_file_name_with_all_that_is_added_to_it(tmp_path, length):
     name = "x" * length
     scenario = named(fake_scenario(0), name)
-    films = VideoRecorder(tmp_path / "films", 9, "all", [name])
+    videos = VideoRecorder(tmp_path / "films", 9, "all", [name])
     frame = np.zeros((16, 16, 3), np.uint8)
     for outcome in Outcome:
         unit = WorkItem(scenario, 2**32 - 1)
-        films.finish(films.begin(unit, frame, 10.0), unit, outcome)
-    assert len(films.kept) == len(Outcome)
+        videos.finish(videos.begin(unit, frame, 10.0), unit, outcome)
+    assert len(videos.kept) == len(Outcome)
     for path in (
         record_path(tmp_path, name),
         tmp_path / f"{name}.png",

@@ -37,7 +37,7 @@ def test_the_tables_count_what_is_there(dataset, capsys):
     assert "3 scenarios" in capsys.readouterr().out
 
 
-def test_one_scenario_becomes_pictures_and_a_film(dataset, tmp_path, capsys):
+def test_one_scenario_becomes_pictures_and_a_video(dataset, tmp_path, capsys):
     import av
 
     scenario = load_scenarios(dataset)[3]
@@ -52,8 +52,8 @@ def test_one_scenario_becomes_pictures_and_a_film(dataset, tmp_path, capsys):
     simulator = make_simulator("fake", observation_size=96)
     hand_off(simulator, scenario)
     np.testing.assert_array_equal(np.asarray(Image.open(folder / "recovery.png")), simulator.render())
-    with av.open(str(folder / "prefix.mp4")) as film:
-        assert sum(1 for _ in film.decode(video=0)) == 10
+    with av.open(str(folder / "prefix.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == 10
 
 
 def test_moments_are_the_states_before_each_action_and_the_recovery_point(dataset):

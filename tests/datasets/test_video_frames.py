@@ -32,8 +32,8 @@ def rollouts(tmp_path):
     return candidate_dataset(tmp_path / "rollouts", 3, steps=STEPS)
 
 
-def film(root: Path, numbers: list[int]) -> Path:
-    """Writes the first camera's film anew with frames at these places of the grid of times."""
+def video(root: Path, numbers: list[int]) -> Path:
+    """Writes the first camera's video anew with frames at these places of the grid of times."""
     from fractions import Fraction
 
     import av
@@ -59,7 +59,7 @@ def shorter(root: Path, episode: int) -> Path:
         for later in range(episode + (part == "from_timestamp"), len(column)):
             column[later] -= 1 / FPS
     pq.write_table(pa.table(table), root / EPISODES)
-    return film(root, list(range(3 * STEPS - 1)))
+    return video(root, list(range(3 * STEPS - 1)))
 
 
 def test_a_whole_dataset_is_counted(rollouts):
@@ -76,10 +76,10 @@ def test_one_frame_short_is_refused_by_name(rollouts, thorough):
 
 
 def test_a_hole_a_lost_end_and_a_missing_file_are_found(rollouts):
-    film(rollouts, [n for n in range(3 * STEPS) if n != STEPS + 3])
+    video(rollouts, [n for n in range(3 * STEPS) if n != STEPS + 3])
     with pytest.raises(ScenarioError, match=rf"episode 1, camera .*: {STEPS - 1} video frames"):
         check_frames(rollouts)
-    film(rollouts, list(range(3 * STEPS - 2)))
+    video(rollouts, list(range(3 * STEPS - 2)))
     with pytest.raises(ScenarioError, match=rf"episode 2, camera .*: {STEPS - 2} video frames"):
         check_frames(rollouts)
     (rollouts / "videos" / CAMERAS[0] / "chunk-000" / "file-000.mp4").unlink()

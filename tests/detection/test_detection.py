@@ -57,7 +57,7 @@ def command(dataset, policy, out, *more, detectors=DETECTORS) -> list[str]:
     named = [part for d in detectors for part in ("--detector", d)]
     return [
         "detect", "evaluate", "--scenarios", str(dataset), "--policy", str(policy), *named,
-        "--out", str(out), "--alpha", "0.4", "--films", "0", *more,
+        "--out", str(out), "--alpha", "0.4", "--frame-strips", "0", *more,
     ]  # fmt: skip
 
 
@@ -74,7 +74,7 @@ def measured(dataset, policy, tmp_path_factory):
                 list(load_scenarios(env.scenarios, split=env.split)), env.start
             ),
         )
-        assert main(command(dataset, policy, out, "--films", "2")) == 0
+        assert main(command(dataset, policy, out, "--frame-strips", "2")) == 0
     return out
 
 

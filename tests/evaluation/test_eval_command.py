@@ -249,8 +249,8 @@ def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(
     assert list(temporary.glob("roborecover-*")) == []
 
 
-def films(out: Path) -> dict[str, int]:
-    """Frames of each film."""
+def videos(out: Path) -> dict[str, int]:
+    """Frames of each video."""
     found = {}
     for path in sorted((out / "videos").iterdir()):
         with av.open(str(path)) as container:
@@ -260,11 +260,11 @@ def films(out: Path) -> dict[str, int]:
 
 def test_videos_of_failures_are_bounded_and_whole(run, whole):
     out = run("--videos=3", "--env.obs_type=state")
-    found = films(out)
+    found = videos(out)
     assert len(found) == 3
     assert all(name.endswith("_horizon.mp4") for name in found)
     assert set(found.values()) == {HORIZON + 1}, "the handoff and every step"
-    assert outcomes(rows_of(out)) == whole, "filming changes nothing"
+    assert outcomes(rows_of(out)) == whole, "recording changes nothing"
     info = json.loads((out / "eval_info.json").read_text())
     paths = [p for task in info["per_task"] for p in task["metrics"]["video_paths"]]
     assert sorted(Path(p).name for p in paths) == sorted(found)
@@ -272,7 +272,7 @@ def test_videos_of_failures_are_bounded_and_whole(run, whole):
 
 def test_videos_of_chosen_scenarios(run):
     chosen = fake_scenario(1).id
-    found = films(run("--videos=9", f"--runner.videos_of={chosen}"))
+    found = videos(run("--videos=9", f"--runner.videos_of={chosen}"))
     assert found
     assert all(name.startswith(chosen) for name in found)
 
@@ -294,7 +294,7 @@ def test_without_videos_nothing_is_rendered(run, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(site))
     run()
     assert not marks.exists()
-    run("--videos=1", out="filmed")
+    run("--videos=1", out="recorded")
     assert marks.stat().st_size >= HORIZON
 
 
@@ -308,7 +308,7 @@ def test_without_videos_nothing_is_rendered(run, monkeypatch, tmp_path):
         (["--shard=7/7"], "0 <= k < n"),
         (["--eval.recording=true"], "--videos=N"),
         (["--env.latency_s=0.1"], "--env.realtime=true only"),
-        (["--env.realtime=true", "--env.meanwhile=chunk"], "4 actions of an inference one by one"),
+        (["--env.realtime=true", "--env.during_inference=chunk"], "4 actions of an inference one by one"),
     ],
 )
 def test_refusals_are_one_line_and_run_nothing(run, capsys, extra, words):

@@ -181,19 +181,19 @@ def frozen(dataset, tmp_path_factory):
 
 
 def test_no_latency_is_a_frozen_clock(dataset, frozen, tmp_path):
-    for meanwhile in ("hold", "chunk"):
+    for during_inference in ("hold", "chunk"):
         rows = engine(
             dataset,
-            tmp_path / f"{meanwhile}.jsonl",
+            tmp_path / f"{during_inference}.jsonl",
             slots=1,
             realtime=True,
             latency_s=0.0,
-            meanwhile=meanwhile,
+            during_inference=during_inference,
         )
         assert facts(rows) == facts(frozen)
-        assert {r.options["realtime"] for r in rows} == {meanwhile}
+        assert {r.options["realtime"] for r in rows} == {during_inference}
         assert {r.config_hash for r in rows}.isdisjoint(r.config_hash for r in frozen)
-    assert not {"realtime", "latency_s", "meanwhile"} & set(frozen[0].options)
+    assert not {"realtime", "latency_s", "during_inference"} & set(frozen[0].options)
     assert any(r.success for r in frozen)
 
 
@@ -206,9 +206,9 @@ def test_given_latency_is_deterministic_and_the_same_in_both_loops(dataset, froz
     assert rows[0].options["latency_s"] == 0.12
     assert all(r.steps <= 40 for r in rows)
     assert facts(rows) != facts(frozen)
-    going_on = engine(dataset, tmp_path / "chunk.jsonl", meanwhile="chunk", **options)
+    going_on = engine(dataset, tmp_path / "chunk.jsonl", during_inference="chunk", **options)
     assert facts(going_on) == facts(
-        engine(dataset, tmp_path / "d.jsonl", slots=1, meanwhile="chunk", **options)
+        engine(dataset, tmp_path / "d.jsonl", slots=1, during_inference="chunk", **options)
     )
     assert facts(going_on) != facts(rows)
 
@@ -222,10 +222,10 @@ def test_measured_latency_is_marked(dataset, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"realtime": True, "meanwhile": "wait"}, "not one of"),
+        ({"realtime": True, "during_inference": "wait"}, "not one of"),
         ({"realtime": True, "latency_s": -1.0}, "from 0 to 600"),
         ({"latency_s": 0.1}, "with --env.realtime=true only"),
-        ({"meanwhile": "chunk"}, "with --env.realtime=true only"),
+        ({"during_inference": "chunk"}, "with --env.realtime=true only"),
     ],
 )
 def test_options_that_are_refused(options, words):
@@ -243,8 +243,8 @@ def test_what_cannot_be_charged_is_refused(dataset, tmp_path):
         create_session(
             options, part, workers=False, facts=PolicyMetadata(execution_horizon=1, intervention=human)
         )
-    options.meanwhile = "chunk"
-    with pytest.raises(OptionError, match=r"Use roborecover eval, or --env\.meanwhile=hold"):
+    options.during_inference = "chunk"
+    with pytest.raises(OptionError, match=r"Use roborecover eval, or --env\.during_inference=hold"):
         create_recovery_envs(
             options, part, n_envs=1, workers=False, facts=PolicyMetadata(execution_horizon=2)
         )

@@ -115,7 +115,7 @@ def _server(metadata=None):
 def test_a_corrected_mapping_and_another_server(run, tmp_path):
     mapping = tmp_path / "mine.yaml"
     mapping.write_text(MAPPING + "actions: {scale: [1.0, 2.0]}\n")
-    remote = ["--policy.type=remote", f"--policy.mapping={mapping}", "--policy.name=mine"]
+    remote = ["--policy.type=roborecover_remote", f"--policy.mapping={mapping}", "--policy.name=mine"]
     with _server() as url:
         rows, printed = run(*remote, url)
         assert rows[0].policy_settings["server_weights"] == "not known"

@@ -47,7 +47,7 @@ def test_the_file_and_the_command_line_are_the_same_run(parse, tmp_path, composi
     env = {"scenarios": tmp_path / "set", "split": "test", "start": "recovery", "select": "id=a|b"}
     run = RunSpec(
         "fake", {**env, "trial_log": tmp_path / "t.jsonl"}, policy, 3, tmp_path / "out",
-        runner={"max_batch": 1, "portable": True, "slots": 0},
+        runner={"max_batch": 1, "cross_cpu_deterministic": True, "slots": 0},
     )  # fmt: skip
     command, *words = run.write(tmp_path / "out" / "run.yaml")
     assert command == "eval"
@@ -55,6 +55,10 @@ def test_the_file_and_the_command_line_are_the_same_run(parse, tmp_path, composi
     program, command, *words = shlex.split(run.command_line())
     assert (program, command) == ("roborecover", "eval")
     assert parse(*words) == (from_file, facts)
-    assert (from_file.eval.n_episodes, from_file.runner.portable, from_file.env.split) == (3, True, "test")
+    assert (from_file.eval.n_episodes, from_file.runner.cross_cpu_deterministic, from_file.env.split) == (
+        3,
+        True,
+        "test",
+    )
     assert facts.execution_horizon == (2 if composite else 1)
     assert facts.policy.startswith("act@")

@@ -22,7 +22,7 @@ def load(what: str):
     return load_detector(what, "cpu")
 
 
-def film(steps: int, size: int = 64) -> list[dict]:
+def frames(steps: int, size: int = 64) -> list[dict]:
     """Pictures and states of a made-up trial."""
     import torch
 
@@ -139,7 +139,7 @@ def put_clip_into_cache(cache: Path, monkeypatch) -> None:
 @pytest.mark.parametrize("kind", ["topreward", "robometer", "sarm"])
 def test_rewards_become_scores(kind, request):
     folder = request.getfixturevalue(kind)
-    seen = film(12)
+    seen = frames(12)
     whole = load(f"{folder},lag=0,stride=2")
     falls = load(f"{folder},lag=3,stride=2,threshold=-100")
     assert set(whole.needs.features) == ({CAMERA, STATE} if kind == "sarm" else {CAMERA})

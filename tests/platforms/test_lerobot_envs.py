@@ -297,7 +297,7 @@ def test_a_base_that_cannot_be_used_is_refused(options, says):
 
 
 def test_the_family_stands_for_its_first_member(capsys):
-    """`roborecover_lerobot` serves several platforms; as a platform's name, it is PushT."""
+    """`roborecover_wrapped` serves several platforms; as a platform's name, it is PushT."""
     scenario = load_scenarios("pusht_starter")[0]
     for name in ("Lerobot", "Lerobot_pusht"):
         env = gym.make(f"roborecover/{name}-v0", scenario=scenario, obs_type="state")

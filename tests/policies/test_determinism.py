@@ -1,4 +1,4 @@
-"""`--runner.portable`: a diffusion policy's noise schedule rounds alike on every processor."""
+"""`--runner.cross_cpu_deterministic`: a diffusion policy's noise schedule rounds alike on every processor."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def ask(policy):
 def test_roots_of_the_schedule_are_correctly_rounded(load):
     import torch
 
-    from lerobot_roborecover.policies.determinism import make_portable
+    from lerobot_roborecover.policies.determinism import make_cross_cpu_deterministic
 
     policy = load("diffusion")
     stock = copy.deepcopy(policy)
-    assert make_portable(policy) == 1
+    assert make_cross_cpu_deterministic(policy) == 1
     scheduler, before = policy.diffusion.noise_scheduler, stock.diffusion.noise_scheduler
     values = scheduler.alphas_cumprod
     assert torch.equal(values.float(), before.alphas_cumprod), "the schedule itself is the same"
@@ -57,16 +57,16 @@ def test_roots_of_the_schedule_are_correctly_rounded(load):
 
 
 def test_policies_without_a_schedule_are_left_alone(load):
-    from lerobot_roborecover.policies.determinism import make_portable
+    from lerobot_roborecover.policies.determinism import make_cross_cpu_deterministic
 
-    assert make_portable(load("act")) == 0
+    assert make_cross_cpu_deterministic(load("act")) == 0
 
 
 def test_members_of_a_composite_are_found(load):
     import torch
 
-    from lerobot_roborecover.policies.determinism import make_portable
+    from lerobot_roborecover.policies.determinism import make_cross_cpu_deterministic
 
     composite = torch.nn.Linear(1, 1)
     composite.policies = [load("act"), load("diffusion")]
-    assert make_portable(composite) == 1
+    assert make_cross_cpu_deterministic(composite) == 1

@@ -186,7 +186,7 @@ def test_only_the_kind_of_device_counts(mine, key):
     "change",
     [
         {"rename_map": {"observation.images.a": "observation.images.b"}},
-        {"portable": True},
+        {"cross_cpu_deterministic": True},
         {"policy": "mine"},
         {"seed": 2},
         {"seed": None},

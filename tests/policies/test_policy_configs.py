@@ -116,7 +116,7 @@ def test_it_parses_and_fits_its_policy_and_its_env(parse, file):
     assert cfg.eval.n_episodes == facts.n_episodes == 5
     assert cfg.eval.n_episodes % cfg.eval.batch_size == 0
     cfg.env.check()
-    if cfg.policy.type == "remote":
+    if cfg.policy.type == "roborecover_remote":
         from lerobot_roborecover.policies.remote.mapping import load_mapping
 
         assert file.stem not in NATIVE

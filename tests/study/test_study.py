@@ -60,7 +60,7 @@ def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
     ]  # fmt: skip
     assert [a.trials for a in found] == [1, 1, 2, 2, 1]
     assert all(a.run.runner["max_batch"] == 1 for a in found)
-    assert all("--runner.portable=true" in a.run.command_line() for a in found)
+    assert all("--runner.cross_cpu_deterministic=true" in a.run.command_line() for a in found)
     assert f"--policy.base.path={study / 'policies' / 'act'}" in found[-1].run.command_line()
 
 

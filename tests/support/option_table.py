@@ -46,7 +46,7 @@ def lerobots_options() -> dict[str, Options]:
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
     from lerobot_roborecover.evaluation.options import RecoveryOptions
     from lerobot_roborecover.evaluation.runner import ALIASES, RunnerOptions
-    from lerobot_roborecover.platforms.base import ENV_PREFIX
+    from lerobot_roborecover.platforms.registry import ENV_PREFIX
     from lerobot_roborecover.policies import ema
     from lerobot_roborecover.policies.detectors.monitor import (
         configuration_roborecover_monitor,
@@ -68,7 +68,7 @@ def lerobots_options() -> dict[str, Options]:
             f"--env.type={ENV_PREFIX}{name}": _of_class(ENV_TYPES[name], "--env.", RecoveryOptions)
             for name in ("fake", "lerobot", "libero", "metaworld", "robotwin")
         },
-        "--policy.type=remote": _of_class(RemoteConfig, "--policy."),
+        "--policy.type=roborecover_remote": _of_class(RemoteConfig, "--policy."),
         "--policy.type=roborecover_intervention": _of_class(RoboRecoverInterventionConfig, "--policy."),
         "--optimizer.type=roborecover_ema_adamw": _of_class(ema.EmaAdamWConfig, "--optimizer."),
         "--reward_model.type=roborecover_monitor": _of_class(

@@ -66,7 +66,7 @@ def command(dataset, out, *policy, slots=1):
 def remote(url, mapping="lerobot", **options):
     quick = {"wait_s": 1, "reconnect_s": 0.2, "timeout_s": 20, **options}
     return [
-        "--policy.type=remote", f"--policy.url={url}", f"--policy.mapping={mapping}",
+        "--policy.type=roborecover_remote", f"--policy.url={url}", f"--policy.mapping={mapping}",
         *(f"--policy.{name}={value}" for name, value in quick.items()),
     ]  # fmt: skip
 

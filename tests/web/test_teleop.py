@@ -17,8 +17,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from lerobot_roborecover.curation.candidates import read_candidates
-from lerobot_roborecover.curation.film import Film, read_film
 from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
+from lerobot_roborecover.curation.video_settings import VideoSettings, read_video_settings
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
 from lerobot_roborecover.scenario import ScenarioError
@@ -241,13 +241,13 @@ def test_a_recording_of_an_earlier_version_is_held_against_the_horizon_when_writ
     late = replace(session.recorded("x", as_dropped=True), mark=(2, "", ""), lacks="")
     late.solved[-1] = True
     said = [
-        _as_candidate(late, simulator, Film(1, {})),
-        _as_candidate(replace(late, mark=None), simulator, Film(1, {})),
+        _as_candidate(late, simulator, VideoSettings(1, {})),
+        _as_candidate(replace(late, mark=None), simulator, VideoSettings(1, {})),
     ]
     assert [r.exclusion for r in said] == ["does not replay"] * 2
     assert said[0].exclusion_detail == "not solved after 75 steps of the replay"
     late.solved[-1] = False
-    assert _as_candidate(late, simulator, Film(1, {})).exclusion == "not solved within the horizon"
+    assert _as_candidate(late, simulator, VideoSettings(1, {})).exclusion == "not solved within the horizon"
     store.close()
 
 
@@ -275,8 +275,8 @@ def test_the_dataset_holds_what_was_saved_and_grows_until_it_is_worked_on(tmp_pa
     assert [(s.step, s.by, s.stage) for s in made.candidates[0].suggestions] == [(5, "operator", "Approach")]
     assert made.row(0).driver == "ann"
     # Who renders its frames again (`validate`) does as was done here.
-    film = read_film(made.row(0).provenance, "here")
-    assert (film.every, film.options["observation_size"]) == (4, 32)
+    video = read_video_settings(made.row(0).provenance, "here")
+    assert (video.every, video.options["observation_size"]) == (4, 32)
     saved = read_recording(store.paths()[0])
     assert made.actions(0).tobytes() == saved.actions.tobytes()
     assert (made.steps(0).bodies["puck"] == saved.bodies["puck"]).all()

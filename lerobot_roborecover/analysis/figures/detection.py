@@ -1,4 +1,4 @@
-"""Curves of detectors side by side, and the moments at which they fire on a film strip."""
+"""Curves of detectors side by side, and the moments at which they fire on a frame strips."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ type Reports = Mapping[str, DetectionReport]
 
 
 @dataclass(frozen=True)
-class FilmStrip:
+class FrameStrip:
     """Pictures of one trial."""
 
     trial: int
@@ -128,7 +128,7 @@ def _finish(axes, place: str) -> None:
 
 
 def strip_figure(
-    strip: FilmStrip, scored: Mapping[str, Sequence[ScoredTrial]], reports: Reports, seed: int
+    strip: FrameStrip, scored: Mapping[str, Sequence[ScoredTrial]], reports: Reports, seed: int
 ) -> Figure:
     """One trial: pictures above, each detector's score below, alarms marked.
 
@@ -152,7 +152,7 @@ def strip_figure(
     title = f"{one.scenario}, {kind}: {ends}; a mark is the first alarm at the conformal threshold"
     words = [f"{n}: first alarm at step {s - one.handoff} after the handoff" for n, s in firsts.items()]
     wide, narrow = both(lambda width: _draw_strip(width, strip, scored, reports, one, firsts))
-    return Figure(f"film_{strip.trial}", title, "; ".join(words) or "no detector alarms", wide, narrow)
+    return Figure(f"frames_{strip.trial}", title, "; ".join(words) or "no detector alarms", wide, narrow)
 
 
 def _threshold(trials: Sequence[ScoredTrial], report: DetectionReport, trial: int, seed: int) -> float:
@@ -163,7 +163,7 @@ def _threshold(trials: Sequence[ScoredTrial], report: DetectionReport, trial: in
 
 
 def _draw_strip(
-    width: Width, strip: FilmStrip, scored: Mapping, reports: Reports, one: ScoredTrial, firsts: Mapping
+    width: Width, strip: FrameStrip, scored: Mapping, reports: Reports, one: ScoredTrial, firsts: Mapping
 ) -> Plot:
     names = list(reports)
     keep = range(len(strip.pictures)) if not width.narrow else range(0, len(strip.pictures), 2)

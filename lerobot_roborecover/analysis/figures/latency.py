@@ -26,19 +26,19 @@ def latency_figure(rates: Sequence[LatencyRate], level: float = LEVEL) -> Figure
     """RSR against the latency charged; frozen clocks stand at 0, measured ones are in the table alone."""
     curves: dict[tuple[str, str], list[LatencyRate]] = {}
     for rate in rates:
-        if rate.meanwhile and not np.isnan(rate.latency_s):
-            curves.setdefault((rate.policy, rate.meanwhile), []).append(rate)
+        if rate.during_inference and not np.isnan(rate.latency_s):
+            curves.setdefault((rate.policy, rate.during_inference), []).append(rate)
     for (policy, _), points in curves.items():
         if all(p.latency_s for p in points):
-            points[:0] = [r for r in rates if r.policy == policy and not r.meanwhile]
+            points[:0] = [r for r in rates if r.policy == policy and not r.during_inference]
 
     def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches, 3.4 + 0.24 * len(curves) if width.narrow else 4.2)
-            for k, ((policy, meanwhile), points) in enumerate(curves.items()):
+            for k, ((policy, during_inference), points) in enumerate(curves.items()):
                 x = 1e3 * np.array([p.latency_s for p in points])
                 y = 100 * np.array([[p.rate.value, p.rate.low, p.rate.high] for p in points])
-                name = f"{short(policy, width.names)}, {meanwhile}"
+                name = f"{short(policy, width.names)}, {during_inference}"
                 style = {"color": colour(k), "ls": dash(k), "marker": marker(k)}
                 axes.plot(x, y[:, 0], lw=2, label=name, **style)
                 axes.fill_between(x, y[:, 1], y[:, 2], color=colour(k), alpha=0.12, lw=0)
@@ -53,8 +53,8 @@ def latency_figure(rates: Sequence[LatencyRate], level: float = LEVEL) -> Figure
         return plot
 
     words = "; ".join(
-        f"{policy} ({meanwhile}) "
+        f"{policy} ({during_inference}) "
         + ", ".join(f"{100 * p.rate.value:.1f} at {1e3 * p.latency_s:g} ms" for p in points)
-        for (policy, meanwhile), points in curves.items()
+        for (policy, during_inference), points in curves.items()
     )
     return Figure("latency", "RSR against latency", f"RSR in per cent: {words}.", *both(draw))

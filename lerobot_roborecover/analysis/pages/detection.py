@@ -1,4 +1,4 @@
-"""Detectors side by side on disk: tables, figures, film strips, numbers, and one page that holds them all."""
+"""Detectors side by side on disk: tables, figures, frame strips, numbers, and one page with all of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from lerobot_roborecover.analysis.detection_scores import write_scores
 from lerobot_roborecover.analysis.figures.detection import (
-    FilmStrip,
+    FrameStrip,
     detection_figures,
     finite,
     strip_figure,
@@ -148,7 +148,7 @@ def write_detection_report(
     out: Path,
     measured: Sequence[MeasuredDetector],
     scored: Mapping[str, Sequence[ScoredTrial]],
-    strips: Sequence[FilmStrip],
+    strips: Sequence[FrameStrip],
     *,
     alpha: float,
     level: float,
@@ -182,8 +182,8 @@ def write_detection_report(
         atomic_write(out / "detectors.md", "\n".join(map(to_markdown, tables)))
         reports = {m.name: m.report for m in measured}
         figures = detection_figures(reports)
-        films = [strip_figure(strip, scored, reports, seed) for strip in strips]
-        for figure in [*figures, *films]:
+        strip_figures = [strip_figure(strip, scored, reports, seed) for strip in strips]
+        for figure in [*figures, *strip_figures]:
             atomic_write(out / f"{figure.name}.svg", svg_of(figure.plot))
             atomic_write(out / f"{figure.name}.png", png_of(figure.plot))
         for name, trials in scored.items():
@@ -201,7 +201,7 @@ def write_detection_report(
         atomic_write(out / NUMBERS_FILE, json.dumps(numbers, indent=1, default=str) + "\n")
         page = render_page(
             "detectors.html.j2", title="Detectors side by side", about=about, tables=tables,
-            pictures=_pictures(figures), films=_pictures(films),
+            pictures=_pictures(figures), strips=_pictures(strip_figures),
         )  # fmt: skip
         atomic_write(out / "detectors.html", page)
         return out / "detectors.html"

@@ -1,4 +1,4 @@
-"""`curate collect`: rollouts from initial states, judged, filmed, and written as a candidate dataset.
+"""`curate collect`: rollouts from initial states, judged, rendered, and written as a candidate dataset.
 
 1. Everything that can be refused is refused before a simulator starts.
 2. Rollouts, through the fast runner; each is a record and a journal's line once it has ended.
@@ -21,7 +21,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.judge import verdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.rollouts import RolloutJournal
-from lerobot_roborecover.curation.collect.run import PARTS_FOLDER, film_and_write, roll_out
+from lerobot_roborecover.curation.collect.run import PARTS_FOLDER, render_and_write, roll_out
 from lerobot_roborecover.curation.collect.settings import claim, differences, driver_of, settings_of
 from lerobot_roborecover.curation.collect.starts import RolloutSpec, make_units
 from lerobot_roborecover.curation.collect.write import read_about
@@ -86,7 +86,7 @@ def collect(options: CollectOptions, say: Callable[[str], None] = print) -> Coll
         kept = [v for v in verdicts if v.dropped is None]
         if not kept:
             return Collected(None, tuple(count_stages(dropped)), 0)
-        film_and_write(options, spec, book, kept, dropped, about)
+        render_and_write(options, spec, book, kept, dropped, about)
     finally:
         book.close()
     shutil.rmtree(work / PARTS_FOLDER, ignore_errors=True)

@@ -28,7 +28,7 @@ class FilterConfig:
     """Exclusion rules that are not asked."""
     only: tuple[str, ...] = ()
     """Exclusion rules that are asked alone; empty for all."""
-    scene_touched_mm: float = 0.0
+    min_displacement_mm: float = 0.0
     """Keep only perturbed rollouts in which the scene ends so far from wherever the undisturbed twin had it;
     0 keeps all."""
 
@@ -55,7 +55,7 @@ class SceneDisturbance:
     tilted_deg: float
 
 
-def scene_touched(record: Record, twin: Record) -> SceneDisturbance:
+def scene_disturbance(record: Record, twin: Record) -> SceneDisturbance:
     """How far the scene ends from every state that the undisturbed rollout had it in.
 
     For each object: the distance of its last position from the nearest on its path in the twin (its start
@@ -113,17 +113,17 @@ def verdict(
     if planned.perturbed:
         notes["perturbed_steps"] = int((flags == PERTURBED).sum())
         notes["unreachable_steps"] = int((flags == UNREACHABLE).sum())
-    if judging.scene_touched_mm:
+    if judging.min_displacement_mm:
         twin = book.find(replace(planned, twin=True).record_name)
         if twin is None or not twin.recorded:
             why = "it was not run" if twin is None else f"{twin.outcome}: {twin.reason}"[:500]
             return drop("no undisturbed twin to compare with", why, "scene-touched")
-        touch = scene_touched(record, read_record(record_path(book.records, twin.rollout)))
+        touch = scene_disturbance(record, read_record(record_path(book.records, twin.rollout)))
         measured = (
             f"{touch.body} ends {touch.displaced_mm:.1f} mm and {touch.tilted_deg:.1f} degrees from its path "
-            f"without disturbance (limits {judging.scene_touched_mm:g} mm or {TOUCHED_TILT_DEG:g} degrees)"
+            f"without disturbance (limits {judging.min_displacement_mm:g} mm or {TOUCHED_TILT_DEG:g} degrees)"
         )
-        if touch.displaced_mm < judging.scene_touched_mm and touch.tilted_deg < TOUCHED_TILT_DEG:
+        if touch.displaced_mm < judging.min_displacement_mm and touch.tilted_deg < TOUCHED_TILT_DEG:
             return drop("the disturbance did not touch the scene", measured, "scene-touched")
         notes["scene_touched"] = {
             "body": touch.body, "displaced_mm": round(touch.displaced_mm, 2),

@@ -59,10 +59,10 @@ class CollectOptions:
     """Of the perturbation, of the policy's noise, and of drivers that draw."""
     horizon: int = 0
     """Budget of each task in steps, of rollouts and of scenarios made from them; 0: the platform's."""
-    film_every: int = 1
+    frame_stride: int = 1
     """Steps from one picture to the next; the last one stands until then."""
     frames: int = 256
-    """Side of the pictures in pixels; 0 films none."""
+    """Side of the pictures in pixels; 0 renders none."""
     workplace: Backend = LOCAL
     """Where rollouts are, and replays for the pictures."""
     slots: int = 0
@@ -101,16 +101,18 @@ class CollectOptions:
             if not low <= getattr(self, name) <= high:
                 option = "num-workers" if name == "slots" else name.removesuffix("_s").replace("_", "-")
                 raise OptionError(f"--{option}={getattr(self, name)}: must be from {low} to {high}")
-        if not 1 <= self.film_every <= 1000:
-            raise OptionError(f"--frame-stride={self.film_every}: 1 to 1000 steps")
+        if not 1 <= self.frame_stride <= 1000:
+            raise OptionError(f"--frame-stride={self.frame_stride}: 1 to 1000 steps")
         if self.frames and not 16 <= self.frames <= 2048:
             raise OptionError(f"--frames={self.frames}: none, or a side of 16 to 2048 pixels")
         own = platform_named(self.platform)
         if self.perturb and not own.perturbable:
             raise OptionError(f"--perturb: {own.why_not_perturbable}. Collect without it")
-        if self.judging.scene_touched_mm and not self.perturb:
-            raise OptionError("--scene-touched: what a disturbance touched can be asked with --perturb alone")
-        if self.judging.scene_touched_mm < 0:
-            raise OptionError(f"--scene-touched={self.judging.scene_touched_mm:g}: millimetres, above 0")
+        if self.judging.min_displacement_mm and not self.perturb:
+            raise OptionError("--min-displacement needs --perturb: it measures what the disturbance moved")
+        if self.judging.min_displacement_mm < 0:
+            raise OptionError(
+                f"--min-displacement={self.judging.min_displacement_mm:g}: millimetres, above 0"
+            )
         check_rules("--no-exclude", self.judging.skip)
         check_rules("--exclude-only", self.judging.only)

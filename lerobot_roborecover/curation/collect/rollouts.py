@@ -120,7 +120,7 @@ def run_expert(units: Iterable[RolloutSpec], pool: SlotPool, slots: int, on_end:
         return queue.take(last, [u.task for u in busy])
 
     workers = pool.worker_slots(min(slots, max(len(queue), 1)))
-    for unit, reply in map_unordered(workers, "drive", take, lambda u: u.scenario):
+    for unit, reply in map_unordered(workers, "roll_out", take, lambda u: u.scenario):
         name = unit.scenario.record_name
         if isinstance(reply, SlotFailure):
             on_end(RolloutOutcome(name, FAILURES[reply.kind].value, 0, reply.message), b"")

@@ -1,4 +1,4 @@
-"""The two long parts of a collection, with their simulators: rolling out, and filming what is kept."""
+"""The two long parts of a collection, with their simulators: rolling out, and rendering what is kept."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lerobot_roborecover.curation.collect.rollouts import (
 from lerobot_roborecover.curation.collect.server import SERVER
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.curation.collect.write import WriterConfig, write_collection
-from lerobot_roborecover.curation.film import Film
+from lerobot_roborecover.curation.video_settings import VideoSettings
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.progress import ProgressLine
 from lerobot_roborecover.evaluation.session import SimulatorSpec
@@ -56,7 +56,7 @@ def roll_out(
 ) -> None:
     """Runs what the book does not hold yet; the undisturbed twins last, of those that failed: what succeeded
     is dropped whatever its twin did."""
-    wants_twins = bool(options.judging.scene_touched_mm)
+    wants_twins = bool(options.judging.min_displacement_mm)
 
     def lacking(wanted: Iterable[RolloutSpec]) -> list[RolloutSpec]:
         return [u for u in wanted if book.find(u.record_name, retry_errors=options.retry_errors) is None]
@@ -146,7 +146,7 @@ def _run_policy(
     run_policy(passes, pool, partial(loading.load_host, spec), places, options.seed, on_end)
 
 
-def film_and_write(
+def render_and_write(
     options: CollectOptions,
     spec: SimulatorSpec,
     book: RolloutJournal,
@@ -154,7 +154,7 @@ def film_and_write(
     dropped: Sequence[Any],
     about: Mapping[str, Any],
 ) -> None:
-    """Films what is kept, and writes the dataset.
+    """Renders what is kept, and writes the dataset.
 
     Args:
         options: of the collection.
@@ -165,10 +165,10 @@ def film_and_write(
         about: content of `meta/roborecover/collect.json`.
 
     Raises:
-        ScenarioError: nothing could be filmed, or the disk is full.
+        ScenarioError: nothing could be rendered, or the disk is full.
     """
     slot = replace(
-        spec.slot, server=SERVER, settings={}, options=_film_options(options, spec), control_mode=None
+        spec.slot, server=SERVER, settings={}, options=_render_options(options, spec), control_mode=None
     )
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
     pool.acquire()
@@ -177,7 +177,7 @@ def film_and_write(
         slots = _settle(pool, later, draws=bool(options.frames))
         versions = pool.ask("fingerprint")
         if not isinstance(versions, dict):
-            raise ScenarioError(f"no simulator could be made to film with: {failed(versions)}")
+            raise ScenarioError(f"no simulator could be made to render with: {failed(versions)}")
         writing = WriterConfig(
             records=book.records,
             parts=book.work / PARTS_FOLDER,
@@ -185,19 +185,19 @@ def film_and_write(
             slots=slots,
             fps=round(pool.spaces()["hz"]),
             versions=versions,
-            frames=f"{options.frames}/{options.film_every}",
-            film=Film(options.film_every, slot.options),
+            frames=f"{options.frames}/{options.frame_stride}",
+            video=VideoSettings(options.frame_stride, slot.options),
             part_size=options.part_size,
             description=options.description,
             license=options.license,
         )
         count, line = Count(0, len(kept)), ProgressLine("writing", detailed=True, unit="candidates")
 
-        def on_film(done: int) -> None:
+        def on_rendered(done: int) -> None:
             count.done = done
             line.show(count, final=done == len(kept))
 
-        write_collection(options.out, kept, dropped, writing, about, on_film)
+        write_collection(options.out, kept, dropped, writing, about, on_rendered)
     except OSError as err:
         raise ScenarioError(
             f"{options.out} could not be written: {err}. Nothing that was finished is lost: make room, and "
@@ -207,6 +207,6 @@ def film_and_write(
         pool.release()
 
 
-def _film_options(options: CollectOptions, spec: SimulatorSpec) -> dict[str, Any]:
-    """Options of the simulator that films: the policy's own, but for what is seen."""
+def _render_options(options: CollectOptions, spec: SimulatorSpec) -> dict[str, Any]:
+    """Options of the simulator that renders: the policy's own, but for what is seen."""
     return {**spec.slot.options, **platform_named(options.platform).picture_options(options.frames)}

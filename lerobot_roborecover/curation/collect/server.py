@@ -1,4 +1,4 @@
-"""The slot server of a collection: records what a policy does, drives scripted experts, films by replay."""
+"""The slot server of a collection: records what a policy does, runs scripted experts, renders by replay."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from lerobot_roborecover.workers.slot_server import SlotServer
 
 SERVER = f"{__name__}:CollectServer"
 REPLY_EVERY_S = 5.0
-"""How long a rollout or a film goes on before its slot gives a sign of life."""
+"""How long a rollout or a rendering goes on before its slot gives a sign of life."""
 
 
 @dataclass(frozen=True)
 class RolloutResult:
-    """Reply to `drive`: how a scripted rollout ended."""
+    """Reply to `roll_out`: how a scripted rollout ended."""
 
     outcome: Outcome
     steps: int
@@ -37,7 +37,7 @@ class RolloutResult:
 
 
 @dataclass(frozen=True)
-class FilmJob:
+class VideoJob:
     """A rollout to be replayed and looked at."""
 
     rollout: Rollout
@@ -49,8 +49,8 @@ class FilmJob:
 
 
 @dataclass(frozen=True)
-class Filmed:
-    """Reply to `film`."""
+class RenderedRollout:
+    """Reply to `render`."""
 
     observations: list[Observation]
     """T raw observations, one before each action."""
@@ -59,7 +59,7 @@ class Filmed:
 
 
 class CollectServer(SlotServer):
-    """A slot that records; without settings it only films.
+    """A slot that records; without settings it only renders.
 
     Args:
         config: `settings` are those of `RecorderSettings`.
@@ -69,19 +69,19 @@ class CollectServer(SlotServer):
         super().__init__(config)
         self._settings = RecorderSettings(**config.settings) if config.settings else None
         self._recording: RecordingSimulator | None = None
-        self._under_way: Iterator[RolloutResult | Filmed | None] = iter(())
+        self._under_way: Iterator[RolloutResult | RenderedRollout | None] = iter(())
         if self._settings is not None:
             self._recording = RecordingSimulator(self._simulator, self._settings)
             self._simulator = cast(Simulator, self._recording)  # by delegation
 
     def answer(self, command: str, argument: object = None) -> object:
-        """`drive` and `film` beside the usual commands."""
-        if command not in ("drive", "film"):
+        """Answers `roll_out` and `render` beside the usual commands."""
+        if command not in ("roll_out", "render"):
             return super().answer(command, argument)
         if isinstance(argument, RolloutSpec):
-            self._under_way = self._drive(argument)
-        elif isinstance(argument, FilmJob):
-            self._under_way = self._film(argument)
+            self._under_way = self._roll_out(argument)
+        elif isinstance(argument, VideoJob):
+            self._under_way = self._render_rollout(argument)
         # A watchdog that counted a whole rollout would take a slow machine for a hung simulator.
         began = time.monotonic()
         for result in self._under_way:
@@ -108,7 +108,7 @@ class CollectServer(SlotServer):
             return result
         return replace(result, attachment=pack_record(self._recording.record()))
 
-    def _drive(self, planned: RolloutSpec) -> Iterator[RolloutResult | None]:
+    def _roll_out(self, planned: RolloutSpec) -> Iterator[RolloutResult | None]:
         """A rollout; yields None after each step, and at last how it ended."""
         assert self._recording is not None
         assert self._settings is not None
@@ -136,7 +136,7 @@ class CollectServer(SlotServer):
                 return
             yield None
 
-    def _film(self, job: FilmJob) -> Iterator[Filmed | None]:
+    def _render_rollout(self, job: VideoJob) -> Iterator[RenderedRollout | None]:
         """A replay; yields None after each step, and at last what was seen."""
         simulator, seen, error = self._simulator, [], 0.0
         steps = len(job.rollout)
@@ -147,4 +147,4 @@ class CollectServer(SlotServer):
             if t < steps:
                 seen.append(simulator.observe() if t % job.every == 0 else seen[-1])
             yield None
-        yield Filmed(seen, error)
+        yield RenderedRollout(seen, error)

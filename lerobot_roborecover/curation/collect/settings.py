@@ -64,6 +64,7 @@ def settings_of(
         "reset seed": options.starts.reset_seed if by_init_state else None,
     }
     judging = asdict(options.judging)
+    judging["scene_touched_mm"] = judging.pop("min_displacement_mm")  # the name in earlier files
     rolled = json.loads(json.dumps(rolled, default=str))
     starts = {k: v for k, v in asdict(options.starts).items() if k != "reset_seed"}
     about = {
@@ -71,7 +72,7 @@ def settings_of(
         "starts": {"tasks": list(options.tasks), **starts, "count": len(units)},
         "judging": judging,
         "frames": options.frames,
-        "film_every": options.film_every,
+        "film_every": options.frame_stride,
     }
     return rolled, json.loads(json.dumps(about))
 

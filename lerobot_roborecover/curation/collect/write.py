@@ -1,4 +1,4 @@
-"""Writes the candidates of a collection: filmed by replay in the workers, in parts, joined at the end.
+"""Writes the candidates of a collection: rendered by replay in the workers, in parts, joined at the end.
 
 A rollout is not rendered while it runs, unless its policy looks at pictures. What is kept is replayed
 afterwards, which is exact, and looked at before each action; a replay that is not where the rollout was is
@@ -22,9 +22,9 @@ from lerobot_roborecover.curation.candidates import Candidate, read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
 from lerobot_roborecover.curation.collect.judge import RolloutVerdict
 from lerobot_roborecover.curation.collect.record import Record, read_record, record_path
-from lerobot_roborecover.curation.collect.server import Filmed, FilmJob
-from lerobot_roborecover.curation.film import Film
+from lerobot_roborecover.curation.collect.server import RenderedRollout, VideoJob
 from lerobot_roborecover.curation.funnel import Decision, record_decisions
+from lerobot_roborecover.curation.video_settings import VideoSettings
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Rollout, ScenarioError
@@ -45,14 +45,14 @@ class WriterConfig:
     parts: Path
     """Folder of the parts."""
     pool: SlotPool
-    """Slots that film, with `collect_server.SERVER`."""
+    """Slots that render, with `collect_server.SERVER`."""
     slots: int
     fps: int
     versions: Mapping[str, str]
     """Of the simulator."""
     frames: str
-    """What is filmed; names the parts, so that another size is filmed anew."""
-    film: Film
+    """What is rendered; names the parts, so that another size is rendered anew."""
+    video: VideoSettings
     """Kept with every candidate, so that what was seen can be rendered again."""
     part_size: int = 20
     """Candidates of a part: what is lost, at most, when the writing is stopped."""
@@ -66,9 +66,9 @@ def write_collection(
     dropped: Iterable[Decision],
     writing: WriterConfig,
     about: Mapping[str, Any],
-    on_film: Callable[[int], None] = lambda done: None,
+    on_rendered: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Films and writes what is kept; `out` appears as a whole, or not at all.
+    """Renders and writes what is kept; `out` appears as a whole, or not at all.
 
     Args:
         out: new or empty.
@@ -76,7 +76,7 @@ def write_collection(
         dropped: decisions on all other rollouts.
         writing: how.
         about: content of `meta/roborecover/collect.json`.
-        on_film: told how many are written.
+        on_rendered: told how many are written.
 
     Raises:
         ScenarioError: nothing could be written, or the folder is not new.
@@ -88,22 +88,22 @@ def write_collection(
         part = writing.parts / _part_name(chunk, writing.frames)
         if not part.is_dir():
             with suppress(_NothingLeft):
-                _write_part(part, chunk, writing, lambda n, done=done: on_film(done + n))
+                _write_part(part, chunk, writing, lambda n, done=done: on_rendered(done + n))
         there = set(read_candidates(part).by_id) if part.is_dir() else set()
         notes = _read_lost(part)
         lost += [
             Decision(
-                v.planned.id, "collect", "dropped", *notes.get(v.planned.id, ("not filmed", "")), "replay"
+                v.planned.id, "collect", "dropped", *notes.get(v.planned.id, ("not rendered", "")), "replay"
             )
             for v in chunk
             if v.planned.id not in there
         ]
         parts += [part] if there else []
         done += len(chunk)
-        on_film(done)
+        on_rendered(done)
     if not parts:
         raise ScenarioError(
-            f"none of the {len(kept)} candidates could be filmed, so {out} is not written. The first: "
+            f"none of the {len(kept)} candidates could be rendered, so {out} is not written. The first: "
             f"{lost[0].reason}: {lost[0].detail}"
         )
     with atomic_dir(out) as whole:
@@ -134,15 +134,15 @@ def read_about(out: Path) -> dict[str, Any] | None:
 
 
 class _NothingLeft(Exception):
-    """No rollout of a part could be filmed."""
+    """No rollout of a part could be rendered."""
 
 
 def _write_part(
-    part: Path, chunk: Sequence[RolloutVerdict], writing: WriterConfig, on_film: Callable[[int], None]
+    part: Path, chunk: Sequence[RolloutVerdict], writing: WriterConfig, on_rendered: Callable[[int], None]
 ) -> None:
     lost: dict[str, tuple[str, str]] = {}
-    films = _films(chunk, writing, lost)
-    first = next(films, None)
+    renderings = _rendered(chunk, writing, lost)
+    first = next(renderings, None)
     _write_lost(part, lost)
     if first is None:
         raise _NothingLeft
@@ -153,8 +153,8 @@ def _write_part(
         while recording is not None:
             yield recording
             count += 1
-            on_film(count + len(lost))
-            recording = next(films, None)
+            on_rendered(count + len(lost))
+            recording = next(renderings, None)
             _write_lost(part, lost)
 
     write_candidates(
@@ -167,39 +167,41 @@ def _write_part(
     )
 
 
-def _films(
+def _rendered(
     chunk: Sequence[RolloutVerdict], writing: WriterConfig, lost: dict[str, tuple[str, str]]
 ) -> Iterator[Recording]:
-    """Recordings of a part, as they are filmed; notes those that are lost, and why."""
+    """Recordings of a part, as they are rendered; notes those that are lost, and why."""
 
-    def job(v: RolloutVerdict) -> FilmJob:
+    def job(v: RolloutVerdict) -> VideoJob:
         record = read_record(record_path(writing.records, v.planned.id))
         poses = record.steps.bodies
 
-        return FilmJob(
+        return VideoJob(
             Rollout(v.planned.task, record.reset, record.actions),
             tuple(poses),
             np.stack(list(poses.values())),
-            writing.film.every,
+            writing.video.every,
         )
 
     workers = writing.pool.worker_slots(min(writing.slots, len(chunk)))
-    for v, film in zip(chunk, map_ordered(workers, "film", chunk, job), strict=True):
-        if failed(film):
-            lost[v.planned.id] = "could not be replayed", failed(film)[:500]
+    for v, rendered in zip(chunk, map_ordered(workers, "render", chunk, job), strict=True):
+        if failed(rendered):
+            lost[v.planned.id] = "could not be replayed", failed(rendered)[:500]
             continue
-        assert isinstance(film, Filmed)
-        if film.error_m > HANDOFF_TOLERANCE_M:
+        assert isinstance(rendered, RenderedRollout)
+        if rendered.error_m > HANDOFF_TOLERANCE_M:
             lost[v.planned.id] = (
                 "its replay is another rollout",
-                f"up to {1e3 * film.error_m:.2f} mm apart (limit {1e3 * HANDOFF_TOLERANCE_M:g} mm)",
+                f"up to {1e3 * rendered.error_m:.2f} mm apart (limit {1e3 * HANDOFF_TOLERANCE_M:g} mm)",
             )
             continue
         record = read_record(record_path(writing.records, v.planned.id))
-        yield _recording(v, record, film, writing.film)
+        yield _recording(v, record, rendered, writing.video)
 
 
-def _recording(v: RolloutVerdict, record: Record, film: Filmed, filmed: Film) -> Recording:
+def _recording(
+    v: RolloutVerdict, record: Record, rendered: RenderedRollout, video: VideoSettings
+) -> Recording:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     planned = v.planned
@@ -209,10 +211,10 @@ def _recording(v: RolloutVerdict, record: Record, film: Filmed, filmed: Film) ->
             task=planned.task,
             driver=planned.driver,
             actions=record.actions,
-            frames=(to_frame(planned.platform, o) for o in film.observations),
+            frames=(to_frame(planned.platform, o) for o in rendered.observations),
             success=False,
             reset=record.reset,
-            provenance={"collect": {**(v.notes or {}), "film": filmed.note()}},
+            provenance={"collect": {**(v.notes or {}), "film": video.note()}},
         ),
         record.steps,
         *((v.exclusion.reason, v.exclusion.detail, f"rule {v.exclusion.rule}") if v.exclusion else ()),

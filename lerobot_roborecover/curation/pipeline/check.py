@@ -83,10 +83,10 @@ def check_build(config: ChainConfig) -> list[str]:
             raise OptionError(f"rejects {rejects} is not there")
         validation = requests.validation_request(config, places)
         validation.workplace.check()
-        if config.screen.curtail and validation.rule.runs > CURTAILED_LEAST:
+        if config.screen.early_stop and validation.rule.runs > CURTAILED_LEAST:
             raise OptionError(
-                f"runs {validation.rule.runs}: with screen.curtail a scenario may have only "
-                f"{CURTAILED_LEAST} trials to replay. Set runs to {CURTAILED_LEAST}, or leave curtail out"
+                f"runs {validation.rule.runs}: with screen.early_stop a scenario may have only "
+                f"{CURTAILED_LEAST} trials to replay. Set runs to {CURTAILED_LEAST}, or leave early_stop out"
             )
         _check_env(config.platform, validation.env)
     with problems.of("split"):
@@ -153,7 +153,7 @@ def _check_sizes(config: ChainConfig) -> None:
     sizes: dict[str, set[tuple[int, int]]] = {}
     for name, part in config.collect.items():
         if part.dataset:
-            sizes[name] = _filmed(Path(part.dataset))
+            sizes[name] = _frame_sizes(Path(part.dataset))
         elif str(part.frames or _SIZE) == "none":
             if not config.annotate.automatic:  # programs read numbers
                 raise OptionError(f"collect.{name}.frames: none; annotators need something to look at")
@@ -171,12 +171,12 @@ def _check_sizes(config: ChainConfig) -> None:
     blind = next((name for name, found in sizes.items() if found == {_NO_VIDEO}), None)
     if blind is not None and not config.validate.no_frames:
         raise OptionError(
-            f"collect.{blind} has no frames to compare replays with; film it (frames: SIDE), or set "
+            f"collect.{blind} has no frames to compare replays with; render it (frames: SIDE), or set "
             "validate.no_frames: true"
         )
 
 
-def _filmed(dataset: Path) -> set[tuple[int, int]]:
+def _frame_sizes(dataset: Path) -> set[tuple[int, int]]:
     """Height and width of a dataset's videos, or `_NO_VIDEO`; nothing where that cannot be told."""
     try:
         features = json.loads((dataset / "meta" / "info.json").read_bytes())["features"].values()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+import sys
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,11 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_names
 from lerobot_roborecover.scenario import ScenarioError
 
+OLD_KEYS = {
+    "slots": "num_workers", "workers": "num_workers", "film_every": "frame_stride", "curtail": "early_stop",
+    "apart": "disjoint_by", "least": "min_per_split", "scene_touched": "min_displacement",
+}  # fmt: skip
+"""Earlier names of keys, which work for one release."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -42,15 +48,15 @@ class CollectPart:
     horizon: int | None = None
     perturb: bool | None = None
     perturb_steps: int | None = None
-    scene_touched: float | None = None
+    min_displacement: float | None = None
     frames: str | int | None = None
-    film_every: int | None = None
+    frame_stride: int | None = None
     no_exclude: list[str] = field(default_factory=list)
     exclude_only: list[str] = field(default_factory=list)
     engine: str | None = None
     ray_address: str | None = None
     replicas: int | None = None
-    slots: int | None = None
+    num_workers: int | None = None
     max_batch: int | None = None
     device: str | None = None
     watchdog: float | None = None
@@ -95,13 +101,13 @@ class ScreenPart:
     trials: int | None = None
     keep: list[Any] | None = None
     max_invalid: int | None = None
-    curtail: bool | None = None
+    early_stop: bool | None = None
     run_seed: int | None = None
     device: str | None = None
     engine: str | None = None
     ray_address: str | None = None
     replicas: int | None = None
-    slots: int | None = None
+    num_workers: int | None = None
     max_batch: int | None = None
     env: dict[str, Any] = field(default_factory=dict)
 
@@ -119,7 +125,7 @@ class ValidatePart:
     rejects: str | None = None
     engine: str | None = None
     ray_address: str | None = None
-    workers: int | None = None
+    num_workers: int | None = None
     limit_s: float | None = None
     env: dict[str, Any] = field(default_factory=dict)
 
@@ -131,8 +137,8 @@ class SplitPart:
     sizes: dict[str, float] = field(default_factory=dict)
     """By split: counts, or fractions."""
     seed: int | None = None
-    apart: str | None = None
-    least: dict[str, dict[str, int]] | None = None
+    disjoint_by: str | None = None
+    min_per_split: dict[str, dict[str, int]] | None = None
     """By split and by cell, source or suite: how many of each at least."""
 
 
@@ -141,7 +147,7 @@ class RenderPart:
     """Options of `roborecover dataset render`."""
 
     frames: int | None = None
-    workers: int | None = None
+    num_workers: int | None = None
     env: dict[str, Any] = field(default_factory=dict)
 
 
@@ -219,7 +225,7 @@ def read_options[Options](kind: type[Options], path: Path) -> Options:
 
 
 def check_keys(kind: Any, content: Any, where: str) -> None:
-    """Refuses keys that a dataclass does not have, at any depth.
+    """Refuses keys that a dataclass does not have, at any depth. Puts new keys in the place of `OLD_KEYS`.
 
     Raises:
         OptionError: names the key, and what is near or there.
@@ -227,6 +233,12 @@ def check_keys(kind: Any, content: Any, where: str) -> None:
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(content, dict):
         hints = typing.get_type_hints(kind)
+        for key in [k for k in content if k not in hints and OLD_KEYS.get(k) in hints]:
+            new = OLD_KEYS[key]
+            if new in content:
+                raise OptionError(f"{where}{key} is the earlier name of {where}{new}; give one of them")
+            content[new] = content.pop(key)
+            print(f"note: {where}{key} is now {where}{new}", file=sys.stderr)
         for key, value in content.items():
             if key not in hints:
                 near = difflib.get_close_matches(str(key), hints, n=3, cutoff=0.6)

@@ -83,7 +83,7 @@ def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path
     judging = FilterConfig(
         tuple(part.no_exclude),
         tuple(part.exclude_only),
-        given(part.scene_touched, FilterConfig.scene_touched_mm),
+        given(part.min_displacement, FilterConfig.min_displacement_mm),
     )
     return CollectOptions(
         platform=config.platform,
@@ -103,10 +103,10 @@ def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path
         judging=judging,
         seed=given(part.seed, default.seed),
         horizon=given(part.horizon, default.horizon),
-        film_every=given(part.film_every, default.film_every),
+        frame_stride=given(part.frame_stride, default.frame_stride),
         frames=parse_side(str(given(part.frames, default.frames))),
         workplace=workplace(part),
-        slots=given(part.slots, default.slots),
+        slots=given(part.num_workers, default.slots),
         replicas=given(part.replicas, default.replicas),
         max_batch=given(part.max_batch, default.max_batch),
         watchdog_s=given(part.watchdog, default.watchdog_s),
@@ -161,7 +161,7 @@ def screen_rule(config: ChainConfig) -> ScreenRule:
         given(part.trials, rule.trials),
         keep,
         given(part.max_invalid, rule.max_invalid),
-        given(part.curtail, rule.curtail),
+        given(part.early_stop, rule.curtail),
     )
 
 
@@ -190,7 +190,7 @@ def screen_request(config: ChainConfig, places: BuildPaths, rule: ScreenRule) ->
         run_seed=given(part.run_seed, ScreenRequest.run_seed),
         env=assignments(part.env),
         device=part.device,
-        slots=given(part.slots, ScreenRequest.slots),
+        slots=given(part.num_workers, ScreenRequest.slots),
         max_batch=given(part.max_batch, ScreenRequest.max_batch),
         workplace=workplace(part),
         replicas=given(part.replicas, ScreenRequest.replicas),
@@ -219,7 +219,7 @@ def validation_request(config: ChainConfig, places: BuildPaths) -> ValidationReq
         ),
         env=assignments(part.env),
         rejects=read_rejects(Path(part.rejects) if part.rejects else None),
-        workers=given(part.workers, default.workers),
+        workers=given(part.num_workers, default.workers),
         workplace=workplace(part),
         limit_s=given(part.limit_s, default.limit_s),
     )
@@ -234,9 +234,12 @@ def split_config(config: ChainConfig) -> SplitConfig:
     part = config.split
     fractions = any(size != int(size) for size in part.sizes.values())
     sizes = {name: float(size) if fractions else int(size) for name, size in part.sizes.items()}
-    check_least(part.least or {}, sizes)
+    check_least(part.min_per_split or {}, sizes)
     return SplitConfig(
-        check_sizes(sizes), given(part.seed, SplitConfig.seed), parse_apart(part.apart), part.least or {}
+        check_sizes(sizes),
+        given(part.seed, SplitConfig.seed),
+        parse_apart(part.disjoint_by),
+        part.min_per_split or {},
     )
 
 
@@ -248,7 +251,7 @@ def render_request(config: ChainConfig, places: BuildPaths) -> RenderRequest:
         places.rendered,
         given(part.frames, default.size),
         assignments(part.env),
-        given(part.workers, default.workers),
+        given(part.num_workers, default.workers),
     )
 
 

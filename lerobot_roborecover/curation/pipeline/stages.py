@@ -25,7 +25,7 @@ from lerobot_roborecover.curation.candidates import CANDIDATES_FILE, STEPS_FILE,
 from lerobot_roborecover.curation.candidates_write import merge_candidates
 from lerobot_roborecover.curation.funnel import read_decisions
 from lerobot_roborecover.curation.pipeline import requests
-from lerobot_roborecover.curation.pipeline.config import ChainConfig
+from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, ChainConfig
 from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.resolution import queued, resolve, write_discussion
@@ -40,9 +40,9 @@ from lerobot_roborecover.utils.text import format_duration, next_command, plural
 STAGES = ("collect", "join", "annotate", "agree", "screen", "validate", "split", "render", "publish")
 JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
-_PACE = ("engine", "ray_address", "replicas", "slots", "workers", "limit_s", "watchdog", "retry_errors")
+_PACE = ("engine", "ray_address", "replicas", "num_workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
-_ADDED = {"curtail", "least"}
+_ADDED = {"early_stop", "min_per_split"}
 """Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 
@@ -336,7 +336,8 @@ def _options(part: Any) -> Any:
     from lerobot_roborecover.policies.identity import policy_identity
 
     given = asdict(part).items()
-    found = {k: v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
+    stored = {new: old for old, new in OLD_KEYS.items()}  # names in the records of earlier builds
+    found = {stored.get(k, k): v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
     if found.get("policy"):
         found["policy"] = policy_identity(found["policy"])
     for policy in found.get("policies", ()):

@@ -94,17 +94,17 @@ def export_training(
 
     def trajectories() -> Iterator[Trajectory]:
         jobs = [RenderJob(line.start, line.actions, line.state_steps) for line in lines]
-        films = zip(lines, values(lines), replayed(jobs, simulator, workers), strict=True)
-        for number, (line, value, film) in enumerate(films, 1):
-            if film.succeeded != line.success or len(film.observations) != line.steps:
+        replays = zip(lines, values(lines), replayed(jobs, simulator, workers), strict=True)
+        for number, (line, value, replay) in enumerate(replays, 1):
+            if replay.succeeded != line.success or len(replay.observations) != line.steps:
                 dropped["whose replay does not end as logged"] += 1
             else:
-                told.append(columns_of(line, value, film))
+                told.append(columns_of(line, value, replay))
                 yield Trajectory(
                     task=line.scenario.task,
                     driver=line.driver,
                     actions=line.actions[line.first :].astype(np.float64),
-                    frames=(to_frame(platform, o) for o in film.observations),
+                    frames=(to_frame(platform, o) for o in replay.observations),
                     success=line.success,
                     scenario=line.scenario,
                     first_step=line.replayed + line.first,
@@ -130,13 +130,13 @@ def export_training(
     )
 
 
-def columns_of(line: TrainingLine, value: np.ndarray, film: RenderedSteps) -> dict[str, np.ndarray]:
+def columns_of(line: TrainingLine, value: np.ndarray, replay: RenderedSteps) -> dict[str, np.ndarray]:
     """What each of an episode's frames says beside observation and action.
 
     Args:
         line: the episode.
         value: (steps,) V.
-        film: its replay.
+        replay: its replay.
 
     Returns:
         (steps,) each, bool or float32.
@@ -145,7 +145,7 @@ def columns_of(line: TrainingLine, value: np.ndarray, film: RenderedSteps) -> di
     returns = returns_to_go(line)
     reward = returns - np.append(returns[1:], 0.0)
     numbers = {
-        REWARD: reward, PROGRESS: film.progress, RETURN: returns, VALUE: value, ADVANTAGE: returns - value,
+        REWARD: reward, PROGRESS: replay.progress, RETURN: returns, VALUE: value, ADVANTAGE: returns - value,
     }  # fmt: skip
     flags = {SUCCESS: last & line.success, DONE: last, INTERVENTION: line.intervention[line.first :]}
     return {**flags, **{name: np.asarray(of, np.float32) for name, of in numbers.items()}}

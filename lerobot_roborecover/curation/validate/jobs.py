@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.candidates import CandidateSet
-from lerobot_roborecover.curation.film import Film, read_film
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial, env_config, read_trials
 from lerobot_roborecover.curation.validate.frames import TAIL
 from lerobot_roborecover.curation.validate.originals import OriginalFrames
 from lerobot_roborecover.curation.validate.replay import DrawnRun, OriginalRollout, ReplayJob
 from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.curation.validate.validation import draw_runs
+from lerobot_roborecover.curation.video_settings import VideoSettings, read_video_settings
 from lerobot_roborecover.datasets.frames import KEPT
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms.versions import installed, required
@@ -27,7 +27,7 @@ from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 _RUN_OPTIONS = ("action_mode",)
 """Simulator options that a policy's trials may have had of their own and that decide what actions mean."""
 
-_FILM_OPTIONS = (
+_RENDER_OPTIONS = (
     "obs_type", "observation_height", "observation_width", "observation_size", "render_quality",
     "camera_name", "camera_names", "camera_name_mapping",
 )  # fmt: skip
@@ -83,8 +83,8 @@ def make_jobs(
             if Outcome(t.row.outcome).valid
         ]
         drawn = draw_runs(scenario.id, valid, request.rule)
-        rollout, film = _rollout(scenario, sets)
-        mine = {**options, **_film_options(film, request)}
+        rollout, video = _rollout(scenario, sets)
+        mine = {**options, **_render_options(video, request)}
         job = ReplayJob(
             scenario,
             tuple(_drawn(name, t, mine) for name, t in drawn),
@@ -123,16 +123,18 @@ def _drawn(name: str, trial: PolicyTrial, options: Mapping[str, Any]) -> DrawnRu
     return DrawnRun(name, row.trial, trial.actions, row.success, row.options.get("control_mode"), own)
 
 
-def _film_options(film: Film, request: ValidationRequest) -> dict[str, Any]:
-    """Simulator options that a rollout was filmed with, but for those that the request names itself."""
+def _render_options(video: VideoSettings, request: ValidationRequest) -> dict[str, Any]:
+    """Simulator options that a rollout was rendered with, but for those that the request names itself."""
     if not request.rule.frames:
         return {}
     named = {option.split("=")[0] for option in request.env}
-    return {k: v for k, v in film.options.items() if k in _FILM_OPTIONS and k not in named}
+    return {k: v for k, v in video.options.items() if k in _RENDER_OPTIONS and k not in named}
 
 
-def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[OriginalRollout | None, Film]:
-    """The rollout that a scenario was made from, around its recovery point, and how it was filmed."""
+def _rollout(
+    scenario: Scenario, sets: Sequence[CandidateSet]
+) -> tuple[OriginalRollout | None, VideoSettings]:
+    """The rollout that a scenario was made from, around its recovery point, and how it was rendered."""
     for found in sets:
         episode = found.by_id.get(scenario.id)
         if episode is None:
@@ -145,10 +147,10 @@ def _rollout(scenario: Scenario, sets: Sequence[CandidateSet]) -> tuple[Original
             )
         last = min(step + TAIL, len(actions))
         around = range(max(step - KEPT + 1, 0), last + 1)
-        film = read_film(found.row(episode).provenance, f"{found.root}: candidate {scenario.id}")
+        video = read_video_settings(found.row(episode).provenance, f"{found.root}: candidate {scenario.id}")
         poses = {s: steps.poses_at(s) for s in around}
-        return OriginalRollout(poses, actions[step:last], len(actions), film.every), film
-    return None, Film()
+        return OriginalRollout(poses, actions[step:last], len(actions), video.every), video
+    return None, VideoSettings()
 
 
 def _key(job: ReplayJob, originals: str) -> str:
@@ -165,7 +167,7 @@ def _key(job: ReplayJob, originals: str) -> str:
         for r in job.runs
     ]
     head = [
-        job.rollout.film_every if job.rollout else 1,
+        job.rollout.frame_stride if job.rollout else 1,
         job.scenario.sha256(), poses, around, runs, dict(job.options), originals,
         simulator_versions(job.scenario.platform),
     ]  # fmt: skip

@@ -48,7 +48,7 @@ class OriginalRollout:
     """(n, A) float64 actions from the recovery point on."""
     steps: int
     """Actions of the whole rollout, and frames of its video."""
-    film_every: int = 1
+    frame_stride: int = 1
     """Steps from one picture of its video to the next; what was seen stands until then."""
 
 
@@ -150,7 +150,7 @@ def _seen_from(scenario: Scenario, originals: Originals | None, rollout: Origina
     first = max(step - KEPT + 1, 0)
     if originals is not None and originals.encoders and rollout is not None:
         first = min(first, *(window(step, rollout.steps, e).start for e in originals.encoders.values()))
-        first -= first % rollout.film_every
+        first -= first % rollout.frame_stride
     return first
 
 
@@ -309,9 +309,9 @@ def _frames(
             result[camera] = np.stack([met.pictures[s][camera] for s in wanted])
             continue
         clip = window(step, job.rollout.steps, encoder)
-        every = job.rollout.film_every
-        filmed = [s - s % every for s in clip]
-        frames = [met.pictures[s][camera] if s <= step else tail[s][camera] for s in filmed]
+        every = job.rollout.frame_stride
+        rendered = [s - s % every for s in clip]
+        frames = [met.pictures[s][camera] if s <= step else tail[s][camera] for s in rendered]
         if frames[0].shape != pictures.shape[1:]:
             result[camera] = np.stack(frames)  # other sizes: `ssim` says so
             continue

@@ -166,14 +166,14 @@ def _trajectories(
     jobs = [RenderJob(c.continuation.scenario, c.continuation.actions, c.steps) for c in ordered]
 
     def made() -> Iterator[Trajectory]:
-        for number, (chosen, film) in enumerate(
+        for number, (chosen, replay) in enumerate(
             zip(ordered, replayed(jobs, simulator, workers), strict=True), 1
         ):
             c = chosen.continuation
             every = np.concatenate([c.scenario.prefix, c.actions.astype(np.float64)])
             frames = (
                 {**to_frame(platform, o), STEP: np.array([s], dtype=np.int64)}
-                for o, s in zip(film.observations, chosen.steps, strict=True)
+                for o, s in zip(replay.observations, chosen.steps, strict=True)
             )
             yield Trajectory(
                 task=c.scenario.task,
@@ -189,7 +189,7 @@ def _trajectories(
                 provenance={
                     "recovery_step": c.recovery_step,
                     "steps": len(every),
-                    "replay_ends_as_recorded": bool(film.succeeded == c.success),
+                    "replay_ends_as_recorded": bool(replay.succeeded == c.success),
                 },
             )
             on_trajectory(part, number, len(ordered))

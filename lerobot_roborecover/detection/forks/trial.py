@@ -91,9 +91,9 @@ class ForkTrial(Trial):
             self.steps = fork.step
             self._executed += [np.array(action) for action in fork.parent.actions[: fork.step]]
 
-    def begin(self, filmed: bool = False) -> EpisodeSpec:
+    def begin(self, record_video: bool = False) -> EpisodeSpec:
         """What a simulator needs to rebuild the fork's state."""
-        spec = super().begin(filmed)
+        spec = super().begin(record_video)
         fork, row = self._fork, self._fork.parent.row
         if fork.arm.teacher_forced:
             return spec

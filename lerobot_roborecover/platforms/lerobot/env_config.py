@@ -12,11 +12,12 @@ from lerobot.envs.configs import EnvConfig, HubEnvConfig, PushtEnv
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.platforms.base import ENV_PREFIX, SimulatorSetup, VideoEnvMixin
+from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
 from lerobot_roborecover.platforms.env_options import no_video
 from lerobot_roborecover.platforms.lerobot.known import KNOWN
 from lerobot_roborecover.platforms.lerobot.platform import DEFAULT_TYPE, HUB_TYPE, member_name
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, check_hub
+from lerobot_roborecover.platforms.registry import ENV_PREFIX
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.utils.plugins import register_plugins
 

@@ -124,7 +124,7 @@ _SEEN = (
 
 
 class LeRobotEnvPlatform(Platform):
-    """`--env roborecover_lerobot --env.base.type=NAME`: every member under one env type."""
+    """`--env roborecover_wrapped --env.base.type=NAME`: every member under one env type."""
 
     name: ClassVar[str] = FAMILY_NAME
     title = "LeRobot's env types"

@@ -156,7 +156,7 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
         ) from err
     for step in pre.steps:
         to_eval = getattr(step, "eval", None)
-        if callable(to_eval):  # SARM's would play film backwards and change the instruction
+        if callable(to_eval):  # SARM's would play frames backwards and change the instruction
             to_eval()
     model.eval()
     return ProgressDetector(model, pre, options)

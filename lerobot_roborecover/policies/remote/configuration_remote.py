@@ -1,4 +1,4 @@
-"""Configuration of the `remote` policy type: a server that is asked for action chunks."""
+"""Configuration of the policy type `roborecover_remote`: a server that returns action chunks."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from lerobot.optim.optimizers import OptimizerConfig
 from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.policies.remote.errors import RemoteError
 
+REMOTE = "roborecover_remote"
+"""The policy type; `remote`, its earlier name, works as well."""
 SCHEMES = {"openpi": ("ws://", "wss://"), "vla_eval": ("ws://", "wss://"), "gr00t": ("tcp://",)}
 """How an address of each protocol begins."""
 _URL, _GR00T_URL = "ws://127.0.0.1:8000", "tcp://127.0.0.1:5555"
 
 
 @PreTrainedConfig.register_subclass("remote")
+@PreTrainedConfig.register_subclass(REMOTE)
 @dataclass
 class RemoteConfig(NotTrained, PreTrainedConfig):
     """A policy on a server that speaks openpi's protocol, vla-eval's, or GR00T's."""

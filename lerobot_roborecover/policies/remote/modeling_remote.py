@@ -1,4 +1,4 @@
-"""The `remote` policy type: action chunks from a server that speaks openpi's protocol, or one of two others.
+"""The policy type `roborecover_remote`: action chunks from a server of one of three protocols.
 
 A request is made per slot, and the requests of a batch travel at once. Each slot keeps what it needs of its
 trial in a `RemoteTrial`: actions not executed yet, the observations of the mapping's window, and the session
@@ -23,7 +23,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
+from lerobot_roborecover.policies.remote.configuration_remote import REMOTE, RemoteConfig
 from lerobot_roborecover.policies.remote.connection import Request
 from lerobot_roborecover.policies.remote.errors import (
     MappingError,
@@ -74,7 +74,7 @@ class RemotePolicy(PreTrainedPolicy):
 
     # LeRobot declares both as None, for subclasses to replace.
     config_class = RemoteConfig  # ty: ignore[invalid-assignment]
-    name = "remote"  # ty: ignore[invalid-assignment]
+    name = REMOTE  # ty: ignore[invalid-assignment]
     config: RemoteConfig
 
     def __init__(self, config: RemoteConfig, **kwargs: Any):

@@ -18,6 +18,7 @@ from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.metadata import policy_metadata
+from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.policies.remote.keys import API_KEY, api_key, check_key
 from lerobot_roborecover.policies.remote.served import ServedPolicy
 from lerobot_roborecover.policies.remote.server import PolicyServer, ServeOptions, is_loopback
@@ -114,7 +115,7 @@ def load_served(config: PreTrainedConfig, rename_map: dict[str, str], max_batch:
     Raises:
         OptionError: the checkpoint is an adapter, or a policy without weights.
     """
-    if config.type == "remote":
+    if isinstance(config, RemoteConfig):
         raise OptionError("--policy.path: this is a remote policy; serve the policy itself")
     if config.use_peft:
         raise OptionError("--policy.path: an adapter; merge it into its base policy first")

@@ -41,7 +41,7 @@ class TeleopConfig:
     """Rows and columns of the live pictures."""
     size: int | None = None
     """Rows and columns of the dataset's pictures; None for the platform's own, 0 for none: numbers alone."""
-    film_every: int = 1
+    frame_stride: int = 1
     """Steps from one of the dataset's pictures to the next, where rendering is slow."""
     spacemouse: float | None = None
     """What the end of a SpaceMouse's range gives, up to 1; None reads none."""
@@ -110,7 +110,13 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
         finally:
             listener.close()
         write_dataset(
-            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+            config.dataset,
+            store,
+            config.platform,
+            dict(config.options),
+            config.size,
+            say,
+            config.frame_stride,
         )
     finally:
         store.close()
@@ -126,7 +132,13 @@ def write(config: TeleopConfig, say: Callable[[str], None]) -> None:
     try:
         _check_platform(store, config.platform)
         write_dataset(
-            config.dataset, store, config.platform, dict(config.options), config.size, say, config.film_every
+            config.dataset,
+            store,
+            config.platform,
+            dict(config.options),
+            config.size,
+            say,
+            config.frame_stride,
         )
     finally:
         store.close()

@@ -17,8 +17,8 @@ import numpy as np
 from lerobot_roborecover.curation.annotation.votes import votes_folder
 from lerobot_roborecover.curation.candidates import Candidate, Suggestion
 from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
-from lerobot_roborecover.curation.film import Film
 from lerobot_roborecover.curation.funnel import DECISIONS_FILE, read_decisions
+from lerobot_roborecover.curation.video_settings import VideoSettings
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.platforms import Simulator, make_simulator
@@ -68,7 +68,7 @@ def write_dataset(
     options: Mapping[str, Any],
     size: int | None,
     say: Callable[[str], None],
-    film_every: int = 1,
+    frame_stride: int = 1,
 ) -> bool:
     """Renders the recordings that no part holds yet, and puts the dataset together.
 
@@ -79,7 +79,7 @@ def write_dataset(
         options: of the simulator, beside its pictures.
         size: rows and columns of the pictures; None for the platform's own, 0 for none.
         say: told the progress.
-        film_every: steps from one picture to the next; the last one stands until then.
+        frame_stride: steps from one picture to the next; the last one stands until then.
 
     Returns:
         Whether there is anything.
@@ -105,13 +105,13 @@ def write_dataset(
         seen = {**options, **view_options(platform, size)}
         simulator = make_simulator(platform, **seen)
         # Numbers cost nothing, and none may stand for another step's.
-        film = Film(1 if size == 0 else film_every, seen)
+        video = VideoSettings(1 if size == 0 else frame_stride, seen)
         try:
             done = len(paths) - sum(len(group) for group, _ in missing)
             for group, part in missing:
                 recordings = [read_recording(path) for path in group]
                 say(f"rendering {done + 1} to {done + len(group)} of {len(paths)}")
-                _write_part(part, recordings, simulator, film)
+                _write_part(part, recordings, simulator, video)
                 done += len(group)
         finally:
             simulator.close()
@@ -127,7 +127,7 @@ def _part_of(folder: Path, group: list[Path]) -> Path:
     return folder / f"part-{first}-{last}"
 
 
-def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, film: Film) -> None:
+def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, video: VideoSettings) -> None:
     versions = simulator.fingerprint()
     for recorded in recordings:
         if dict(recorded.versions) != versions:
@@ -137,14 +137,14 @@ def _write_part(part: Path, recordings: list[Recorded], simulator: Simulator, fi
             )
     write_candidates(
         part,
-        (_as_candidate(recorded, simulator, film) for recorded in recordings),
+        (_as_candidate(recorded, simulator, video) for recorded in recordings),
         fps=round(simulator.control_hz),
         versions=versions,
         description="Driven by hand with `roborecover curate teleop`.",
     )
 
 
-def _as_candidate(recorded: Recorded, simulator: Simulator, film: Film) -> Recording:
+def _as_candidate(recorded: Recorded, simulator: Simulator, video: VideoSettings) -> Recording:
     count, mark = len(recorded.actions), recorded.mark
     error_m, solved = _replay(recorded, simulator)
     differs = np.flatnonzero(solved != recorded.solved)
@@ -166,11 +166,11 @@ def _as_candidate(recorded: Recorded, simulator: Simulator, film: Film) -> Recor
             task=recorded.task,
             driver=recorded.operator,
             actions=recorded.actions,
-            frames=_frames(recorded, simulator, film.every),
+            frames=_frames(recorded, simulator, video.every),
             # With a recovery point: whether it was recovered from. Without one: as the rollout ended.
             success=bool(recorded.solved[-1]) if mark is None else not lacks,
             reset=recorded.reset,
-            provenance={"teleop": {**recorded.notes, "film": film.note()}},
+            provenance={"teleop": {**recorded.notes, "film": video.note()}},
         ),
         Steps(recorded.bodies, recorded.solved, np.full(count, UNPERTURBED, np.int8)),
         exclusion=reason,
@@ -191,12 +191,14 @@ def _replay(recorded: Recorded, simulator: Simulator) -> tuple[float, np.ndarray
     return largest, solved
 
 
-def _frames(recorded: Recorded, simulator: Simulator, film_every: int) -> Iterator[Mapping[str, np.ndarray]]:
+def _frames(
+    recorded: Recorded, simulator: Simulator, frame_stride: int
+) -> Iterator[Mapping[str, np.ndarray]]:
     from lerobot_roborecover.datasets.episodes import to_frame
 
     frame: Mapping[str, np.ndarray] = {}
     for step in iter_steps(simulator, recorded.rollout, len(recorded.actions) - 1):
-        if step % film_every == 0:
+        if step % frame_stride == 0:
             frame = to_frame(recorded.task.platform, simulator.observe())
         yield frame
 

@@ -13,24 +13,24 @@ _FOLDERS = ("assets_dir", "robotwin_root")
 
 
 @dataclass(frozen=True)
-class Film:
+class VideoSettings:
     """Pictures of one rollout."""
 
     every: int = 1
     """Steps from one picture to the next; the last one stands until then."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the simulator that filmed."""
+    """Of the simulator that rendered."""
 
     def note(self) -> dict[str, Any]:
         """For the provenance, under `film`."""
         return {"every": self.every, "options": {k: v for k, v in self.options.items() if k not in _FOLDERS}}
 
 
-def read_film(provenance: Mapping[str, Any], where: str) -> Film:
+def read_video_settings(provenance: Mapping[str, Any], where: str) -> VideoSettings:
     """Reads the render settings from a rollout's provenance; a frame at every step where it has none.
 
     Raises:
-        ScenarioError: the note is none of `Film.note`'s.
+        ScenarioError: the note is none of `VideoSettings.note`'s.
     """
     for notes in provenance.values():
         found = notes.get("film") if isinstance(notes, Mapping) else None
@@ -38,6 +38,6 @@ def read_film(provenance: Mapping[str, Any], where: str) -> Film:
             continue
         every = found.get("every", 1) if isinstance(found, Mapping) else None
         if type(every) is not int or every < 1 or not isinstance(found.get("options", {}), Mapping):
-            raise ScenarioError(f"{where} says it was filmed {str(found)[:200]}; record it again")
-        return Film(every, dict(found.get("options", {})))
-    return Film()
+            raise ScenarioError(f"{where} says it was rendered with {str(found)[:200]}; record it again")
+        return VideoSettings(every, dict(found.get("options", {})))
+    return VideoSettings()
