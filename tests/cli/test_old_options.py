@@ -26,6 +26,7 @@ OLD = {
     "curate donors": "--base-below=--max-base-rate --donor-above=--min-donor-rate --workers=--num-workers",
     "curate training-data": "--of=--outcome --workers=--num-workers",
     "detect data": "--every=--stride --workers=--num-workers",
+    "eval-monitor": "--films=--frame-strips",
     "detect evaluate": "--workers=--num-workers --films=--frame-strips",
     "detect fork": "--of=--outcome --at=--steps --every=--stride --slots=--num-workers",
 }
