@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -149,7 +150,21 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     print(donors.funnel_table(funnel))
     print(
-        f"\nlerobot-train --config_path=policies/train/correction_act.yaml --dataset.repo_id=local/donors "
-        f"--dataset.root={args.out} --output_dir=correction"
+        f"\nlerobot-train --config_path={_training_config(args.base)} --policy.path={_checkpoint(args.base)} "
+        f"--dataset.repo_id=local/donors --dataset.root={args.out} --output_dir=correction"
     )
     return 0
+
+
+def _training_config(base: str) -> str:
+    """Returns the shipped training configuration of the base's type, which a folder tells."""
+    try:
+        kind = json.loads((Path(base) / "config.json").read_text()).get("type")
+    except (OSError, ValueError):
+        kind = None
+    return f"policies/train/correction_{kind if kind in ('act', 'pi05', 'smolvla') else '<type>'}.yaml"
+
+
+def _checkpoint(base: str) -> str:
+    """Returns the base as `lerobot-train` takes it; a name in the logs (NAME@HASH) is none."""
+    return base if Path(base).is_dir() or "@" not in base else "<checkpoint>"

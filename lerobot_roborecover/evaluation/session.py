@@ -5,6 +5,7 @@ before a simulator starts.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -209,8 +210,9 @@ def create_session(
     log = TrialLog(options.trial_log_path(facts.output_dir))
     trials = "" if facts.n_episodes is None else f", {facts.n_episodes} trials each"
     logger.info(
-        "RoboRecover: %d scenarios of %s%s from %s; trial log %s (%d rows already there)",
-        len(scenarios), scenarios.source, trials, start.value, log.path, len(log),
+        "RoboRecover: %d scenarios of %s%s%s from %s; trial log %s (%d rows already there)",
+        len(scenarios), scenarios.source, _all_splits(scenarios, options), trials, start.value, log.path,
+        len(log),
     )  # fmt: skip
     for remark in log.other_rows(protocol):
         logger.warning("%s", remark)
@@ -275,6 +277,15 @@ def _of_this_run(scenarios: ScenarioSet, options: RecoveryOptions, platform: str
             f"Use at most {len(scenarios)}"
         )
     return replace(part, scenarios=tuple(map(_without_pictures, part)))
+
+
+def _all_splits(scenarios: ScenarioSet, options: RecoveryOptions) -> str:
+    """Says what a run without `--env.split` mixes: " (all splits: test 64, train 131; ...)"."""
+    counts = Counter(s.split for s in scenarios)
+    if options.split or len(counts) < 2:
+        return ""
+    parts = ", ".join(f"{split} {counts[split]}" for split in sorted(counts))
+    return f" (all splits: {parts}; --env.split=test takes the tests alone)"
 
 
 def _without_pictures(scenario: Scenario) -> Scenario:

@@ -240,6 +240,7 @@ def test_the_command_reads_trials_and_shows_the_funnel(tmp_path, capsys):
     assert "     4  scenarios of split train" in table
     assert "- 2 of a source record that has its trajectory already" in table
     assert "     2  trajectories that succeed again when replayed" in table
+    assert "correction_<type>.yaml --policy.path=<checkpoint> --dataset" in table
     note = json.loads((tmp_path / "out" / "meta" / "roborecover" / "donors.json").read_text())
     assert note["base"] == BASE
     assert [s["count"] for s in note["funnel"]] == [4, 4, 4, 4, 2, 2]
@@ -335,3 +336,12 @@ def test_trials_of_a_donor_go_on_after_a_kill(tmp_path):
     ]
     assert len(read_trials(tmp_path / "killed")) == len(told[0]) == 48
     assert told[0] == told[1]
+
+
+def test_the_training_command_begins_at_the_base(tmp_path):
+    from lerobot_roborecover.cli.donors import _checkpoint, _training_config
+
+    (tmp_path / "config.json").write_text('{"type": "smolvla"}')
+    assert _training_config(str(tmp_path)) == "policies/train/correction_smolvla.yaml"
+    assert _checkpoint(str(tmp_path)) == str(tmp_path)
+    assert _checkpoint("lerobot/pi05_libero") == "lerobot/pi05_libero"

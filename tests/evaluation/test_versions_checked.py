@@ -60,3 +60,20 @@ def test_other_assets_are_a_warning(tmp_path, caplog):
         _, opened = session.create_session(options, spec, workers=False)
     opened.pool.close()
     assert "fake_assets aaaa; here it is bbbb" in caplog.text
+
+
+@pytest.mark.parametrize(("split", "said"), [("", True), ("test", False)])
+def test_a_run_says_which_splits_it_mixes(split, said, tmp_path, caplog):
+    """A set that is named takes all its splits."""
+    from lerobot_roborecover.evaluation.options import RecoveryOptions
+    from lerobot_roborecover.workers.messages import SlotConfig
+
+    both = [replace(fake_scenario(k), split=s) for k, s in enumerate(("train", "test"))]
+    root = write_scenarios(tmp_path / "set", both)
+    options = RecoveryOptions(scenarios=str(root), split=split, trial_log=str(tmp_path / "log.jsonl"))
+    with caplog.at_level(logging.INFO):
+        _, opened = session.create_session(
+            options, session.SimulatorSpec(SlotConfig("fake"), {}, None), workers=False
+        )
+    opened.pool.close()
+    assert ("(all splits: test 1, train 1; --env.split=test takes the tests alone)" in caplog.text) is said
