@@ -58,7 +58,7 @@ class Subject:
 
 
 _LIBERO = Path("policies/libero")
-_METAWORLD = Path("lerobot_roborecover/data/metaworld_study/policies")
+_METAWORLD = Path("policies/study/metaworld_study/policies")
 SUBJECTS = {
     "libero": Subject(
         "libero_recovery", _LIBERO / "act_few",

@@ -48,7 +48,6 @@ COMMANDS = (
     Command("leaderboard", "leaderboard", "Make a leaderboard from trial logs; offer results to the Hub."),
     Command("serve", "serve", "Serve a LeRobot policy over openpi's websocket protocol."),
     Command("reproduce", "reproduce", "Reproduce a published score, then measure recovery."),
-    Command("study", "study", "Run a study again, and compare it trial by trial."),
     Command("merge", "merge", "Join the trial logs of shards."),
     Command("export-ema", "export_ema", "Write a training run's averaged weights as a checkpoint."),
     Command("dataset inspect", "inspect", "Show what a dataset holds; replay one scenario.", "inspect"),
@@ -80,6 +79,9 @@ COMMANDS = (
 
 SPLIT_NAMES = {"eval-monitor": ("eval_monitor", ("detect evaluate", "detect evaluate-frames"))}
 """Old names that are two commands now: the module that still takes the options of both, and the two."""
+
+OUTSIDE = {"study": "python -m recipes.study"}
+"""Old names that are no commands of the package now, each a module in this folder; what to run in a clone."""
 
 
 @dataclass(frozen=True)
@@ -116,16 +118,18 @@ def find_call(argv: Sequence[str]) -> Call | None:
     name = argv[0] if argv else ""
     if name in SPLIT_NAMES:
         module, now = SPLIT_NAMES[name]
-        return Call(name, module, tuple(argv[1:]), _note(name, now))
+        names = " and ".join(f'"roborecover {command}"' for command in now)
+        return Call(name, module, tuple(argv[1:]), _note(name, names))
+    if name in OUTSIDE:
+        return Call(name, name, tuple(argv[1:]), _note(name, f'"{OUTSIDE[name]}"'))
     for command in COMMANDS:
         if command.old and command.old == name:
-            return Call(name, command.module, tuple(argv[1:]), _note(name, (command.name,)))
+            return Call(name, command.module, tuple(argv[1:]), _note(name, f'"roborecover {command.name}"'))
     return None
 
 
-def _note(old: str, now: Sequence[str]) -> str:
-    names = " and ".join(f'"roborecover {name}"' for name in now)
-    return f'note: "roborecover {old}" is now {names}'
+def _note(old: str, now: str) -> str:
+    return f'note: "roborecover {old}" is now {now}'
 
 
 def nearest_name(word: str, group: str = "") -> str:

@@ -136,19 +136,23 @@ def load_scenarios(
     return found.select(select)
 
 
-def builtin_names() -> list[str]:
-    """Names of the scenario sets that come with this package."""
-    return sorted(_builtin())
+def builtin_names(*, shipped: bool = False) -> list[str]:
+    """Names of the scenario sets that are found by name.
+
+    Args:
+        shipped: only those that come with the package, not those of the studies in a clone.
+    """
+    return sorted(_builtin(shipped=shipped))
 
 
-def _builtin() -> dict[str, Path]:
-    """Folder of each set of the package by its name; a study's are in its `scenarios`."""
-    data = importlib.resources.files("lerobot_roborecover").joinpath("data")
-    if not data.is_dir():
-        return {}
-    roots = [root for d in data.iterdir() for root in (d, d.joinpath("scenarios"))]
-    found = [Path(str(r)) for r in roots if r.joinpath(FOLDER, MANIFEST_FILE).is_file()]
-    return {(r.parent if r.name == "scenarios" else r).name: r for r in found}
+def _builtin(*, shipped: bool = False) -> dict[str, Path]:
+    """Folder of each set by its name: a set of the package, or the `scenarios` of a study of the clone."""
+    package = Path(str(importlib.resources.files("lerobot_roborecover")))
+    found = {path.name: path for path in package.glob("data/*")}
+    if not shipped:
+        studies = {path.name: path / "scenarios" for path in package.parent.glob("policies/study/*")}
+        found = studies | found
+    return {name: path for name, path in found.items() if (path / FOLDER / MANIFEST_FILE).is_file()}
 
 
 def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path, str | None]:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from lerobot_roborecover.datasets.card import render_card, render_text
-from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
+from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet, builtin_names
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.envhub import HubScenarios
 from lerobot_roborecover.platforms import platform_named
@@ -33,7 +33,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
     """
     if not HUB_ID.fullmatch(repo_id):
         raise OptionError(f"--repo-id {repo_id!r:.120}: write it like org/name")
-    if Path(scenarios.source).expanduser().is_dir() and scenarios.revision is None:
+    if scenarios.revision is None and scenarios.source not in builtin_names(shipped=True):
         raise OptionError(
             f"scenarios {scenarios.source!r:.200}: a folder, which others do not have. Publish it "
             "(roborecover dataset publish), and name it as org/name"

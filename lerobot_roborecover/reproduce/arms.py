@@ -19,6 +19,7 @@ from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.child import run_module
 from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_log
@@ -27,7 +28,6 @@ from lerobot_roborecover.platforms.registry import platform_of
 from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
 from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
 from lerobot_roborecover.scenario import ScenarioError, Start
-from lerobot_roborecover.study.child import run_module
 from lerobot_roborecover.utils.atomic_io import atomic_write
 
 INITIAL, RECOVERY = str(Start.INITIAL), str(Start.RECOVERY)

@@ -30,7 +30,7 @@ from recipes.metaworld.study_policies import CONFIGS, EPISODES_PER_TASK, make_de
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.training import Training
 
-STUDY = Path("lerobot_roborecover/data/metaworld_study")
+STUDY = Path("policies/study/metaworld_study")
 SCENARIOS = "metaworld_recovery"
 POOL = {"act": 1, "act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}
 """Policies whose recoveries are learned from, and their trials of each training scenario."""

@@ -10,6 +10,7 @@ from lerobot_roborecover.cli import collect
 from lerobot_roborecover.cli.main import command_parser
 from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.tree import find_call
+from recipes.study import __main__ as study
 from tests.support.option_table import written
 
 OLD = {
@@ -47,6 +48,8 @@ VALUES = {"--outcome": "failures", "--disjoint-by": "record", "--min-per-split":
 def parser_of(command: str) -> argparse.ArgumentParser:
     if command == "curate collect":
         return collect.build_parser()
+    if command == "study":
+        return study.build_parser()
     call = find_call(command.split())
     assert call is not None
     return command_parser(call)

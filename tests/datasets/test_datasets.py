@@ -231,9 +231,11 @@ def test_a_built_in_name_comes_before_a_folder_of_that_name(tmp_path, monkeypatc
     fake_dataset(tmp_path / "package" / "data" / "toy_starter", 2)
     (tmp_path / "package" / "data" / "notes").mkdir()
     fake_dataset(tmp_path / "here" / "toy_starter", 3)
+    fake_dataset(tmp_path / "policies" / "study" / "toy_study" / "scenarios", 1)
     monkeypatch.setattr(importlib.resources, "files", lambda package: tmp_path / "package")
     monkeypatch.chdir(tmp_path / "here")
-    assert builtin_names() == ["toy_starter"]
+    assert builtin_names() == ["toy_starter", "toy_study"], "a clone has its studies' sets, too"
+    assert len(load_scenarios("toy_study")) == 1
     found = load_scenarios("toy_starter")
     assert (len(found), found.source, found.revision) == (2, "toy_starter", None)
     assert "./toy_starter" in caplog.text

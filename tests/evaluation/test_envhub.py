@@ -71,14 +71,19 @@ def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
     folder = fake_dataset(tmp_path / "set", 2)
     assert main(["envhub", str(folder), *common]) == 2
     assert "roborecover dataset publish" in capsys.readouterr().err
+    assert main(["envhub", "metaworld_study", *common]) == 2, "of a clone alone"
+    assert "which others do not have" in capsys.readouterr().err
     assert main(["envhub", "metaworld_starter", "--repo-id", "no id", "--out", str(tmp_path / "x")]) == 2
     assert "org/name" in capsys.readouterr().err
 
 
 def test_env_files_of_earlier_versions_find_their_import():
+    from lerobot_roborecover.env.envhub import make_hub_env
+
     from lerobot_roborecover.env import envhub as before
     from lerobot_roborecover.evaluation import envhub
 
+    assert make_hub_env is envhub.make_hub_env
     assert before.make_hub_env is envhub.make_hub_env
     assert before.HubScenarios is envhub.HubScenarios
 

@@ -12,9 +12,9 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import arms
-from lerobot_roborecover.study.definition import StudyDefinition
-from lerobot_roborecover.study.evaluate import _what_ran
+from recipes.study.arms import arms
+from recipes.study.definition import StudyDefinition
+from recipes.study.evaluate import _what_ran
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.trial_rows import trial_row, write_log
 

@@ -18,8 +18,8 @@ from lerobot_roborecover.analysis.stats.macro import macro_9_estimates, macro_es
 from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts, rank_agreement
 from lerobot_roborecover.analysis.stats.units import ResamplingUnit
 from lerobot_roborecover.analysis.tables import Column, cell_text
-from lerobot_roborecover.study.definition import read_definition, shipped_study
-from lerobot_roborecover.study.stored import write_stored_logs
+from recipes.study.definition import read_definition, shipped_study
+from recipes.study.stored import write_stored_logs
 
 ROOT = Path(__file__).resolve().parents[2]
 MODES = {

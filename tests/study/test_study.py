@@ -1,4 +1,4 @@
-"""`roborecover study`: commands, stored outcomes, refusals; and a whole small study on the fake simulator."""
+"""`python -m recipes.study`: commands, stored outcomes, refusals; a whole study on the fake simulator."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.cli.main import main as roborecover
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import arms
-from lerobot_roborecover.study.definition import read_definition, shipped_study, write_definition
-from lerobot_roborecover.study.evaluate import compare_with_stored, run_arm
-from lerobot_roborecover.study.make import assemble, chain_for, comes_with_the_package
-from lerobot_roborecover.study.outcomes import compare, read_outcomes, write_outcomes
-from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
-from lerobot_roborecover.study.stages import stages
+from recipes.study.__main__ import main
+from recipes.study.arms import arms
+from recipes.study.definition import read_definition, shipped_study, write_definition
+from recipes.study.evaluate import compare_with_stored, run_arm
+from recipes.study.make import assemble, chain_for, comes_with_the_package
+from recipes.study.outcomes import compare, read_outcomes, write_outcomes
+from recipes.study.recipe import StudyRecipe, read_recipe
+from recipes.study.stages import stages
 from tests.support.factories import fake_dataset, save_policy
 
 COUNT = 4
@@ -70,7 +71,7 @@ def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
 def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
     define(study, policies={"act": 2}, interventions=[])
     out = tmp_path / "out"
-    command = ["study", "--data", str(study), "--out", str(out), "--slots", "1"]
+    command = ["--data", str(study), "--out", str(out), "--slots", "1"]
     assert main([*command, "--no-report"]) == 0
     said = capsys.readouterr().out
     assert "[2/2] act/" in said
@@ -80,7 +81,7 @@ def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
 
     # Stored, and run again: elsewhere, with more simulators, on a part of the scenarios.
     write_outcomes(study / "outcomes.csv", outcomes)
-    again = ["study", "--data", str(study), "--out", str(tmp_path / "again"), "--slots", "2", "--every", "2"]
+    again = ["--data", str(study), "--out", str(tmp_path / "again"), "--slots", "2", "--every", "2"]
     assert main([*again, "--no-report"]) == 0
     assert "8 of 8 trials came out as stored" in capsys.readouterr().out
 
@@ -117,9 +118,9 @@ def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, m
     today = {**stored, ("act", "s", 0): ("success", 22), ("act", "s", 2): ("success", 17)}
     write_outcomes(study / "outcomes.csv", stored)
     found = read_definition(study)
-    monkeypatch.setattr("lerobot_roborecover.study.evaluate.outcomes_of", lambda done: today)
+    monkeypatch.setattr("recipes.study.evaluate.outcomes_of", lambda done: today)
     for can, different, close in ((True, {0, 2}, set()), (False, {2}, {0})):
-        monkeypatch.setattr("lerobot_roborecover.study.evaluate.has_kernels", lambda can=can: can)
+        monkeypatch.setattr("recipes.study.evaluate.has_kernels", lambda can=can: can)
         compared = compare_with_stored(found, [])
         assert ({d[0][2] for d in compared.different}, {d[0][2] for d in compared.close}) == (
             different,
@@ -158,7 +159,7 @@ def test_a_definition_that_cannot_be_used(study, changes, message):
 
 def test_refusals(study, tmp_path, capsys):
     def refused(*argv: str) -> str:
-        assert main(["study", *argv]) == 2
+        assert main(argv) == 2
         return capsys.readouterr().err
 
     assert "has no study.json" in refused("--data", str(tmp_path))
@@ -177,7 +178,7 @@ def test_an_arm_that_cannot_start_is_told_before_the_first_trial_of_any(study, t
     out = tmp_path / "out"
     save_policy(study / "correction", "act", action=3)
     define(study, policies={"act": 1}, interventions=["reversion", "correction"])
-    assert main(["study", "--data", str(study), "--out", str(out), "--no-report"]) == 2
+    assert main(["--data", str(study), "--out", str(out), "--no-report"]) == 2
     message = capsys.readouterr().err
     (told,) = (line for line in message.splitlines() if "cannot start" in line)
     assert "correction-recovery/run.yaml: --policy.correction.path=" in told
@@ -278,10 +279,24 @@ def test_a_recipe_that_makes_no_sense_is_refused(tmp_path, monkeypatch, text, sa
 
 
 def test_a_study_that_does_not_ship_is_named(capsys):
-    assert main(["study", "--name", "robotwin"]) == 2
+    assert main(["--name", "robotwin"]) == 2
     said = capsys.readouterr().err
-    assert "no study 'robotwin' comes with the package; there are" in said
+    assert "no study 'robotwin' in policies/study; there are" in said
     assert "metaworld" in said
+
+
+def test_the_old_name_works_in_a_clone_and_says_where_one_is_needed(tmp_path, monkeypatch, capsys):
+    assert roborecover(["study", "--stride", "0"]) == 2
+    note, refused = capsys.readouterr().err.splitlines()
+    assert note == 'note: "roborecover study" is now "python -m recipes.study"'
+    assert refused == "python -m recipes.study: --stride=0: a count from 1"
+    monkeypatch.chdir(tmp_path)
+    assert roborecover(["study", "--use-stored-outcomes"]) == 2
+    _, refused = capsys.readouterr().err.splitlines()
+    assert refused == (
+        "roborecover study: studies are not installed. Run them in the top folder of a clone of the "
+        "repository: python -m recipes.study"
+    )
 
 
 def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(study, tmp_path, monkeypatch):
@@ -298,7 +313,7 @@ def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(stud
     assert "--env.scenarios=metaworld_starter" in run
     assert "--policy.path=policies/fake/act" in run
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ScenarioError, match="no study 'mine'"):
+    with pytest.raises(ScenarioError, match="run this in the top folder of a clone"):
         shipped_study("mine")
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = Path(str(files("lerobot_roborecover"))) / "data" / "metaworld_study" / "policies"
+SHIPPED = ROOT / "policies" / "study" / "metaworld_study" / "policies"
 NAMES = ("act", "act_clean", "act_few", "diffusion", "diffusion_few", "tdmpc")
 
 pytestmark = [pytest.mark.metaworld, pytest.mark.lerobot]

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import pytest
 
-from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.study.arms import arms
-from lerobot_roborecover.study.definition import read_definition, shipped_study
-from lerobot_roborecover.study.evaluate import run_arm, scenario_ids
-from lerobot_roborecover.study.outcomes import outcomes_of, read_outcomes
+from recipes.study.__main__ import main
+from recipes.study.arms import arms
+from recipes.study.definition import read_definition, shipped_study
+from recipes.study.evaluate import run_arm, scenario_ids
+from recipes.study.outcomes import outcomes_of, read_outcomes
 
 STUDIES = ("metaworld", "metaworld_recovery", "libero")
 SLICES = (
@@ -54,7 +54,7 @@ def test_a_trial_that_a_bit_decides_comes_out_as_stored(tmp_path):
 @pytest.mark.parametrize(("name", "every"), SLICES)
 def test_a_slice_comes_out_as_stored(name, every, tmp_path, capsys):
     study = read_definition(shipped_study(name))
-    status = main(["study", "--name", name, "--every", str(every), "--out", str(tmp_path), "--no-report"])
+    status = main(["--name", name, "--every", str(every), "--out", str(tmp_path), "--no-report"])
     said = capsys.readouterr().out
     trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
     total = trials * len(scenario_ids(study, every))

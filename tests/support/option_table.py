@@ -15,6 +15,7 @@ from typing import Any
 from lerobot_roborecover.cli.main import build_parser, command_parser
 from lerobot_roborecover.cli.old_options import OldName
 from lerobot_roborecover.cli.tree import GROUPS, SPLIT_NAMES, find_call
+from recipes.study import __main__ as study
 
 FILE = Path(__file__).parents[1] / "cli" / "options.json"
 
@@ -28,6 +29,7 @@ def our_options() -> dict[str, Options]:
     for name, parser in _parsers_of(build_parser()).items():
         inner = {f"{name} {word}": p for word, p in _parsers_of(parser).items()} if name in GROUPS else {}
         found |= {name: _of_parser(p) for name, p in (inner or {name: parser}).items()}
+    found["study"] = _of_parser(study.build_parser())
     for name in SPLIT_NAMES:
         call = find_call([name])
         assert call is not None

@@ -58,7 +58,7 @@ def test_a_policy_gets_kernels_that_its_processor_has(monkeypatch, can):
 
 
 def test_the_shipped_study_names_them():
-    from lerobot_roborecover.study.definition import read_definition, shipped_study
+    from recipes.study.definition import read_definition, shipped_study
 
     assert read_definition(shipped_study()).environment == KERNELS
 

@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_roborecover.evaluation.spec import RunSpec
 from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
-from lerobot_roborecover.study.definition import StudyDefinition
+from recipes.study.definition import StudyDefinition
 
 STARTS = ("recovery", "initial")
 

@@ -14,23 +14,23 @@ from typing import Any
 from lerobot_roborecover.analysis.make import Gallery, Report, report
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.evaluation.child import CANNOT_START, run_module, stop_running
 from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
 from lerobot_roborecover.evaluation.sizes import SLOT_GB
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import StudyArm, arms, report_command
-from lerobot_roborecover.study.child import CANNOT_START, run_module, stop_running
-from lerobot_roborecover.study.definition import StudyDefinition
-from lerobot_roborecover.study.outcomes import (
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.determinism import has_kernels
+from lerobot_roborecover.utils.text import output_end
+from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from recipes.study.arms import StudyArm, arms, report_command
+from recipes.study.definition import StudyDefinition
+from recipes.study.outcomes import (
     STEPS_BAND,
     ReproductionCheck,
     compare,
     outcomes_of,
     read_outcomes,
 )
-from lerobot_roborecover.utils.atomic_io import atomic_write
-from lerobot_roborecover.utils.determinism import has_kernels
-from lerobot_roborecover.utils.text import output_end
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
 
 DONE_FILE = "done.json"
 """Beside the log of an arm that has finished: the run that it was."""
@@ -143,7 +143,7 @@ def check_arms(waiting: Sequence[StudyArm], study: StudyDefinition, out: Path) -
     runs = [str(arm.out / RUN_FILE) for arm in waiting]
     log = out / "trials" / "startable.log"
     with log.open("wb") as stream:
-        status = run_module("lerobot_roborecover.study.startable", runs, study.environment, stream)
+        status = run_module("recipes.study.startable", runs, study.environment, stream)
     if status:
         output = log.read_text(errors="replace")
         told = [f"  {line}" for line in output.splitlines() if line.startswith(CANNOT_START)]

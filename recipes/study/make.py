@@ -15,15 +15,15 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
 from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
+from lerobot_roborecover.evaluation.child import run_module
 from lerobot_roborecover.policies.ship import ship
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.child import run_module
-from lerobot_roborecover.study.definition import StudyDefinition, read_definition, write_definition
-from lerobot_roborecover.study.recipe import StudyRecipe, read_recipe
-from lerobot_roborecover.study.stages import CHECKPOINT, stages
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
 from lerobot_roborecover.utils.determinism import KERNELS
 from lerobot_roborecover.utils.journal import append_records
+from recipes.study.definition import StudyDefinition, read_definition, write_definition
+from recipes.study.recipe import StudyRecipe, read_recipe
+from recipes.study.stages import CHECKPOINT, stages
 
 
 def make(

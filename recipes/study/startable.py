@@ -1,4 +1,4 @@
-"""Loads every run's policy once, in one process: `python -m lerobot_roborecover.study.startable RUN.yaml`.
+"""Loads every run's policy once, in one process: `python -m recipes.study.startable RUN.yaml`.
 
 An arm that cannot start is found before the first trial of any, and not when its turn comes after hours.
 """
@@ -6,10 +6,10 @@ An arm that cannot start is found before the first trial of any, and not when it
 import sys
 from collections.abc import Sequence
 
+from lerobot_roborecover.evaluation.child import CANNOT_START
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.policies.command_line import run_with_arguments
-from lerobot_roborecover.study.child import CANNOT_START
 
 
 def _load(cfg: RecoveryEvalConfig) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.arms import StudyArm
+from recipes.study.arms import StudyArm
 
 COLUMNS = ("arm", "scenario_id", "trial", "outcome", "steps")
 

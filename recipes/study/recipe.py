@@ -8,7 +8,7 @@ from pathlib import Path
 from lerobot_roborecover.curation.pipeline.config import read_options
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.study.definition import IN_CHECKOUT
+from recipes.study.definition import IN_CHECKOUT
 
 RECIPES = IN_CHECKOUT
 

@@ -14,7 +14,6 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ DEFAULT = "metaworld"
 MAX_TRIALS = 1000
 
 IN_CHECKOUT = Path("policies/study")
-"""Studies too large for the package, whose policies are the checkout's."""
+"""Folder of the studies, from the top of a clone."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
@@ -82,21 +81,23 @@ class StudyDefinition:
 
 
 def shipped_study(name: str = DEFAULT) -> Path:
-    """Folder of a study that comes with the package, or with the checkout that one stands in.
+    """Returns the folder of a study of the clone that this is run in.
 
     Raises:
         ScenarioError: there is none.
     """
-    data = Path(str(resources.files("lerobot_roborecover"))) / "data"
-    paths = [*IN_CHECKOUT.glob(f"*/{DEFINITION_FILE}"), *data.glob(f"*_study/{DEFINITION_FILE}")]
-    folders = {path.parent.name.removesuffix("_study"): path.parent for path in paths}
-    if name not in folders:
+    folders = {
+        path.parent.name.removesuffix("_study"): path.parent
+        for path in IN_CHECKOUT.glob(f"*/{DEFINITION_FILE}")
+    }
+    if name in folders:
+        return folders[name]
+    if folders:
         raise ScenarioError(
-            f"no study {name!r:.80} comes with the package; there are {', '.join(sorted(folders))}. The top "
-            f"folder of a checkout of the repository has those of {IN_CHECKOUT} as well, and --make makes "
-            "them anew"
+            f"no study {name!r:.80} in {IN_CHECKOUT}; there are {', '.join(sorted(folders))}. Take one of "
+            "these, or make one with --make"
         )
-    return folders[name]
+    raise ScenarioError(f"no study in {IN_CHECKOUT}: run this in the top folder of a clone of the repository")
 
 
 def read_definition(root: Path) -> StudyDefinition:
@@ -110,7 +111,7 @@ def read_definition(root: Path) -> StudyDefinition:
         found: dict[str, Any] = json.loads(path.read_text())
     except FileNotFoundError:
         raise ScenarioError(
-            f"{root} is not a study: it has no {DEFINITION_FILE}. `roborecover study --make` makes one"
+            f"{root} is not a study: it has no {DEFINITION_FILE}. `python -m recipes.study --make` makes one"
         ) from None
     except (OSError, ValueError, RecursionError) as err:
         raise ScenarioError(f"{path} cannot be read as JSON ({err!s:.200})") from None

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.scenario import Outcome, ScenarioError
-from lerobot_roborecover.study.arms import StudyArm, arms
-from lerobot_roborecover.study.definition import StudyDefinition
-from lerobot_roborecover.study.outcomes import read_outcomes
 from lerobot_roborecover.utils.atomic_io import atomic_write
+from recipes.study.arms import StudyArm, arms
+from recipes.study.definition import StudyDefinition
+from recipes.study.outcomes import read_outcomes
 
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.results import Results
