@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 import lerobot_roborecover  # noqa: F401 - before numpy: it pins how simulators round
 
@@ -18,6 +19,9 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # No test may reach the network.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+# No example is expected within a time: other work on the machine makes anything slow.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 
 @pytest.fixture(autouse=True)
