@@ -53,7 +53,7 @@ class Tail:
 
     def frames(self, scenario: Scenario) -> LastFrames:
         """What was seen, when the recovery point is reached."""
-        png = {camera: tuple(_encode(p[camera]) for p in self._seen) for camera in self._seen[-1]}
+        png = {camera: tuple(encode_png(p[camera]) for p in self._seen) for camera in self._seen[-1]}
         return LastFrames(scenario.id, scenario.sha256(), len(scenario.prefix), png)
 
 
@@ -80,7 +80,8 @@ def camera_pictures(platform: str, observation: Observation) -> dict[str, np.nda
     return {f"observation.images.{name}": np.array(upright(p)) for name, p in pixels.items()}
 
 
-def _encode(picture: np.ndarray) -> bytes:
+def encode_png(picture: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8 as PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -11,11 +11,12 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
+from lerobot_roborecover.logs.robot import problem_of as robot_problem
 from lerobot_roborecover.scenario import DeviationType, Outcome, Source, Stage, Start
 
-TRIAL_SCHEMA = 3
+TRIAL_SCHEMA = 4
 """1: rows without `progress`. 2: rows without `first_state`, `policy_settings`, `run_scenarios`, `run_trials`
-and `shard`. Both are read as rows that say nothing of these."""
+and `shard`. 3: rows without `robot`. All are read as rows that say nothing of these."""
 MAX_LINE_BYTES = 2**24
 """Longest line of a log; a row has about 1.5 kB."""
 MAX_STEPS = 100_000
@@ -237,6 +238,11 @@ def _progress(field: str, value: Any) -> None:
         raise refused(field, value, "neither null nor a list of whole per cents")
 
 
+def _robot(field: str, value: Any) -> None:
+    if problem := robot_problem(value):
+        raise FieldProblem(f"field {field!r}: {problem}. {REMEDY}")
+
+
 def _schema(field: str, value: Any) -> None:
     if type(value) is not int or not 1 <= value <= TRIAL_SCHEMA:
         raise FieldProblem(
@@ -299,6 +305,7 @@ FIELD_CHECKS: dict[str, Callable[[str, Any], None]] = {
     "run_scenarios": _optional_size,
     "run_trials": _optional_size,
     "shard": _shard,
+    "robot": _robot,
 }
 """A check for every field of a row, in the order of `TrialRow`."""
 REPEATED = tuple(

@@ -149,6 +149,10 @@ class TrialRow:
     shard: str = ""
     """Part of the selection that the run had, `k/n` with k from 0; empty in logs before schema 3."""
 
+    robot: dict | None = None
+    """What only a robot's trial has: start error, verdict, rater, reset time (`logs.robot.RobotTrial`).
+    None for simulated trials, and in logs before schema 4."""
+
     def key(self) -> tuple:
         """What makes it the same trial: a rerun that meets the key again skips it."""
         return trial_key(self.scenario_sha256, self.scenario_id, self.config_hash, self.trial)
@@ -186,6 +190,7 @@ def make_row(
     interventions: Iterable = (),
     progress: Sequence[int] | None = None,
     extent: RunExtent | None = None,
+    robot: Mapping[str, Any] | None = None,
 ) -> TrialRow:
     """The one place where a trial row is built."""
     labels = scenario.labels
@@ -240,6 +245,7 @@ def make_row(
         run_scenarios=extent.scenarios if extent else None,
         run_trials=extent.trials if extent else None,
         shard=extent.shard if extent else "",
+        robot=None if robot is None else dict(robot),
     )
 
 

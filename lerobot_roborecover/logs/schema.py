@@ -88,12 +88,13 @@ class RowChecker:
         return value
 
 
-_SINCE_3 = {
+_ADDED = {
     "first_state": "",
     "policy_settings": None,
     "run_scenarios": None,
     "run_trials": None,
     "shard": "",
+    "robot": None,
 }
 
 
@@ -101,7 +102,7 @@ def _upgrade(record: dict[str, Any]) -> None:
     """Makes a row of an earlier schema one of today's, which says nothing of what it lacks."""
     if record["schema"] == 1:
         record.setdefault("progress", None)
-    for name, unsaid in _SINCE_3.items():
+    for name, unsaid in _ADDED.items():
         record.setdefault(name, unsaid)
     record["schema"] = TRIAL_SCHEMA
 
@@ -113,7 +114,8 @@ def _check_together(record: Mapping[str, Any]) -> None:
         raise FieldProblem(
             f"field 'success': success is {success!r} but the outcome is {outcome!r}. {REMEDY}"
         )
-    if outcome == Outcome.HORIZON and steps < horizon:
+    # On a robot a person ends a failed trial, often before its time is up.
+    if outcome == Outcome.HORIZON and steps < horizon and record["robot"] is None:
         raise refused("steps", steps, f"but the outcome is 'horizon', after all of {horizon} steps")
     if steps > horizon and not (record["interventions"] and not Outcome(outcome).valid):
         # A trial that broke while it ran on after a rollback has taken more; its outcome is invalid.

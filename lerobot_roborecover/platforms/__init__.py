@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from lerobot_roborecover.platforms.base import Platform, SimulatorSetup
-from lerobot_roborecover.platforms.registry import BUILT_IN, ENTRY_POINTS, platform_names, registered
+from lerobot_roborecover.platforms.registry import BUILT_IN, ENTRY_POINTS, ROBOT, platform_names, registered
 from lerobot_roborecover.platforms.simulator import Observation, Simulator, SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -69,7 +69,7 @@ def make_simulator(platform: str, **options: Any) -> Simulator:
 
 @cache
 def _load(name: str) -> Platform | None:
-    if name in BUILT_IN:
+    if name in (*BUILT_IN, ROBOT):
         return importlib.import_module(f"lerobot_roborecover.platforms.{name}").PLATFORM
     if name.startswith(_FAMILY) and name not in registered():
         from lerobot_roborecover.platforms.lerobot import member
