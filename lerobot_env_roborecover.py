@@ -8,4 +8,5 @@ from lerobot_roborecover.platforms.versions import lerobot_note
 if note := lerobot_note():
     logging.getLogger(__name__).warning(note)
 
-import lerobot_roborecover.plugin  # noqa: F401
+import lerobot_roborecover.plugin
+import lerobot_roborecover.robot.lab.config_lab_robot  # noqa: F401 - register types

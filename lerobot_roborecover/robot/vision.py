@@ -1,0 +1,291 @@
+"""Compares a live picture with a recorded one: has the camera moved, have the objects, by how much?
+
+The order matters. The arm is put back first, so that it covers the same pixels in both pictures. The camera
+is judged on the static background: pixels that did not change while the episode was recorded. Only after its
+shift is taken out are objects compared, where people have drawn them, or on the foreground of the recovery
+point. LeRobot #4496 shows what happens otherwise: a tripod that moved is scored as the policy's failure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from lerobot_roborecover.logs.robot import CameraError
+
+_CHANGED = 18.0
+"""Grey levels by which a pixel has changed while the episode was recorded, after smoothing."""
+_MIN_STATIC = 0.15
+"""Least share of a picture that has to be static background."""
+_MIN_REGION_PX = 12
+_BORDER = 0.06
+"""Share of a picture's sides that no match may lean on: a shift brings in what the other does not show."""
+_SEARCH = 0.2
+"""How far an object is looked for, as a share of the picture's side."""
+_TAGS = cv2.aruco.DICT_4X4_50
+_MAX_ORB_RESIDUAL_PX = 1.5
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A camera's recorded picture at the recovery point, with what its episode tells of each pixel."""
+
+    picture: np.ndarray
+    """(H, W, 3) uint8."""
+    static: np.ndarray
+    """(H, W) bool: background that did not change."""
+    objects: np.ndarray
+    """(H, W) bool: foreground of the recovery point, or what people have drawn."""
+
+    @classmethod
+    def of(cls, frames: np.ndarray) -> Reference:
+        """From moments of an episode.
+
+        Args:
+            frames: (K, H, W, 3) uint8, the recovery point last. With one frame alone, everything is taken
+                for background and object at once.
+        """
+        picture = frames[-1]
+        if len(frames) < 2:
+            whole = np.ones(picture.shape[:2], bool)
+            return cls(picture, whole, whole)
+        smooth = np.stack([cv2.GaussianBlur(_grey(f), (0, 0), 1.5) for f in frames])
+        changed = (smooth.max(0) - smooth.min(0)) > _CHANGED
+        changed = cv2.dilate(changed.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+        static = ~changed
+        if static.mean() < _MIN_STATIC:  # a wrist camera: all of its background moved with the arm
+            static = np.ones_like(static)
+        # The arm is part of the foreground, too: at the same joints it has not shifted, and does no harm.
+        foreground = np.abs(smooth[-1] - np.sort(smooth, axis=0)[len(smooth) // 2]) > _CHANGED
+        objects = cv2.dilate(foreground.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        return cls(picture, static, objects if objects.any() else changed)
+
+    def with_boxes(self, boxes: list[tuple[int, int, int, int]]) -> Reference:
+        """The same with object regions that a person has drawn.
+
+        Args:
+            boxes: left, top, width, height in pixels.
+        """
+        objects = np.zeros_like(self.objects)
+        for left, top, width, height in boxes:
+            objects[top : top + height, left : left + width] = True
+        return replace(self, objects=objects, static=self.static & ~objects)
+
+
+def compare(reference: Reference, live: np.ndarray, tag_side_mm: float | None = None) -> CameraError:
+    """Measures how a live picture differs from the recorded one.
+
+    Args:
+        reference: the recorded picture.
+        live: (H, W, 3) uint8, with the arm where it was.
+        tag_side_mm: side of the fiducial tags (ArUco 4x4_50) in the scene; None looks for none.
+    """
+    shift = background_shift(reference, live)
+    if shift is None:
+        shift_px, aligned = None, live
+    else:
+        shift_px = float(np.hypot(*shift))
+        aligned = _moved(live, (-shift[0], -shift[1]))
+    object_px, similarity = object_shift(reference, aligned)
+    tag_mm = None if tag_side_mm is None else tag_shift_mm(reference.picture, live, tag_side_mm)
+    return CameraError(shift_px, object_px, similarity, tag_mm)
+
+
+def background_shift(reference: Reference, live: np.ndarray) -> tuple[float, float] | None:
+    """Columns and rows by which the static background has shifted; None where it has too little structure.
+
+    Features that agree on one shift give it where it is large; phase correlation refines it to parts of a
+    pixel.
+    """
+    coarse = _feature_shift(reference, live)
+    if coarse is None:
+        coarse = (0.0, 0.0)
+    start = np.round(coarse)
+    moved = _moved(live, (-float(start[0]), -float(start[1])))
+    mask = _inner(reference.static, np.abs(start).max())
+    if mask.sum() < _MIN_REGION_PX:
+        return None
+    one, other = _grey(reference.picture), _grey(moved)
+    if one[mask].std() < 2.0:
+        return None
+    # Masked pixels are set to the mean of both: an edge at the same place in both pictures would vote for
+    # no shift.
+    weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.0) * mask
+    window = cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F)
+    parts = [(g - float(g[mask].mean())) * weight for g in (one, other)]
+    (column, row), response = cv2.phaseCorrelate(*parts, window)
+    if response < 0.02:
+        return None
+    fine = _refined(parts[0], parts[1], (column, row))
+    return float(start[0] + fine[0]), float(start[1] + fine[1])
+
+
+def _refined(one: np.ndarray, other: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
+    """The shift that least squares find next to a start (`cv2.findTransformECC` without its scaling)."""
+    shift = np.array(start, float)
+    for _ in range(8):
+        moved = _moved(other, (-float(shift[0]), -float(shift[1])))
+        rows, columns = np.gradient(moved)
+        inner = _inner(np.ones(one.shape, bool), np.abs(shift).max())
+        gradient = np.stack([columns[inner], rows[inner]], 1)
+        # moved(x) is other(x + shift); a small error d of the shift changes it by gradient . d
+        step, *_ = np.linalg.lstsq(gradient, (one - moved)[inner], rcond=None)
+        if not np.isfinite(step).all() or np.abs(step).max() > 2.0:
+            return start
+        shift += step
+        if np.abs(step).max() < 0.01:
+            break
+    return (float(shift[0]), float(shift[1])) if np.hypot(*(shift - start)) < 2.0 else start
+
+
+def _feature_shift(reference: Reference, live: np.ndarray) -> tuple[float, float] | None:
+    """The shift on which most matched features agree; None where too few do."""
+    orb = cv2.ORB.create(nfeatures=400, fastThreshold=8, edgeThreshold=12, patchSize=21)
+    mask = reference.static.astype(np.uint8)
+    points, found = orb.detectAndCompute(_grey(reference.picture).astype(np.uint8), mask)
+    others, seen = orb.detectAndCompute(_grey(live).astype(np.uint8), None)
+    if found is None or seen is None or len(points) < 4 or len(others) < 4:
+        return None
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(found, seen)
+    if len(matches) < 6:
+        return None
+    gaps = np.array([np.subtract(others[m.trainIdx].pt, points[m.queryIdx].pt) for m in matches])
+    near = np.abs(gaps[:, None] - gaps[None]).max(-1) < _MAX_ORB_RESIDUAL_PX
+    best = int(near.sum(1).argmax())
+    if near[best].sum() < max(6, 0.2 * len(matches)):
+        return None
+    column, row = np.median(gaps[near[best]], 0)
+    return float(column), float(row)
+
+
+def object_shift(reference: Reference, live: np.ndarray) -> tuple[float | None, float | None]:
+    """Pixels by which the object region has shifted, and its similarity there.
+
+    Args:
+        reference: the recorded picture.
+        live: (H, W, 3) uint8, with the camera's own shift taken out.
+
+    Returns:
+        None each where the region is too small, or has no structure.
+    """
+    boxes = _boxes(reference.objects)
+    shifts, similarities = [], []
+    side = max(reference.picture.shape[:2])
+    reach = max(round(_SEARCH * side), 3)
+    for left, top, width, height in boxes:
+        patch = reference.picture[top : top + height, left : left + width]
+        mask = reference.objects[top : top + height, left : left + width]
+        y0, x0 = max(top - reach, 0), max(left - reach, 0)
+        around = live[y0 : top + height + reach, x0 : left + width + reach]
+        if around.shape[0] <= height or around.shape[1] <= width or patch.std() < 2.0:
+            continue
+        weights = np.repeat(mask.astype(np.float32)[..., None], 3, 2)
+        scores = cv2.matchTemplate(
+            around.astype(np.float32), patch.astype(np.float32), cv2.TM_CCOEFF_NORMED, mask=weights
+        )
+        scores = np.where(np.isfinite(scores), scores, -1.0)
+        row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+        fine_row, fine_column = _peak(scores, int(row), int(column))
+        shifts.append(float(np.hypot(x0 + fine_column - left, y0 + fine_row - top)))
+        similarities.append(float(np.clip(scores[row, column], -1.0, 1.0)))
+    if not shifts:
+        return None, None
+    return max(shifts), min(similarities)
+
+
+def _peak(scores: np.ndarray, row: int, column: int) -> tuple[float, float]:
+    """A maximum between pixels: the top of a parabola through its neighbours, along each axis."""
+
+    def along(before: float, here: float, after: float) -> float:
+        curve = before - 2 * here + after
+        return 0.0 if curve >= -1e-9 else float(np.clip(0.5 * (before - after) / curve, -0.5, 0.5))
+
+    fine_row, fine_column = float(row), float(column)
+    if 0 < row < scores.shape[0] - 1:
+        fine_row += along(*scores[row - 1 : row + 2, column])
+    if 0 < column < scores.shape[1] - 1:
+        fine_column += along(*scores[row, column - 1 : column + 2])
+    return fine_row, fine_column
+
+
+def tag_shift_mm(recorded: np.ndarray, live: np.ndarray, side_mm: float) -> float | None:
+    """Largest shift of a tag that both pictures show, millimetres in the tag's own plane.
+
+    The tag's side in pixels gives the scale, so no calibration of the camera is needed.
+
+    Args:
+        recorded: (H, W, 3) uint8.
+        live: (H, W, 3) uint8.
+        side_mm: of the tags.
+    """
+    before, now = find_tags(recorded), find_tags(live)
+    found = []
+    for number in before.keys() & now.keys():
+        corners = before[number]
+        side_px = np.linalg.norm(np.roll(corners, 1, 0) - corners, axis=1).mean()
+        gap_px = np.linalg.norm(now[number].mean(0) - corners.mean(0))
+        found.append(float(side_mm * gap_px / side_px))
+    return max(found, default=None)
+
+
+def find_tags(picture: np.ndarray) -> Mapping[int, np.ndarray]:
+    """(4, 2) corners in pixels of each tag (ArUco 4x4_50) by number."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.minMarkerPerimeterRate = 0.02
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_TAGS), parameters)
+    # Small pictures are enlarged: the detector's bit cells need some pixels each.
+    scale = max(1, round(480 / max(picture.shape[:2])))
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    corners, numbers, _ = detector.detectMarkers(large)
+    if numbers is None:
+        return {}
+    return {int(n): c.reshape(4, 2) / scale for n, c in zip(numbers.ravel(), corners, strict=True)}
+
+
+def ghost(recorded: np.ndarray, live: np.ndarray, view: str) -> np.ndarray:
+    """What a person sees who puts a scene back: (H, W, 3) uint8.
+
+    Args:
+        recorded: (H, W, 3) uint8.
+        live: (H, W, 3) uint8 of the same size.
+        view: `blend`, `difference`, `edges` (recorded red, live green), `recorded` or `live`.
+    """
+    if view == "difference":
+        return cv2.absdiff(recorded, live)
+    if view == "edges":
+        edges = [cv2.Canny(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY), 60, 140) for p in (recorded, live)]
+        return np.stack([*edges, np.zeros_like(edges[0])], -1)
+    if view in ("recorded", "live"):
+        return recorded if view == "recorded" else live
+    return cv2.addWeighted(recorded, 0.5, live, 0.5, 0.0)
+
+
+def _grey(picture: np.ndarray) -> np.ndarray:
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+
+def _moved(picture: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
+    """A picture shifted by columns and rows."""
+    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+    size = (picture.shape[1], picture.shape[0])
+    return cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _inner(mask: np.ndarray, shift_px: float) -> np.ndarray:
+    """A mask without the pixels near the border that a shift replaces."""
+    edge = int(np.ceil(shift_px)) + max(round(_BORDER * min(mask.shape)), 1)
+    inner = np.zeros_like(mask)
+    inner[edge:-edge, edge:-edge] = mask[edge:-edge, edge:-edge]
+    return inner
+
+
+def _boxes(mask: np.ndarray) -> list[tuple[int, int, int, int]]:
+    """Left, top, width and height of the connected regions of a mask, the largest three."""
+    count, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    found = sorted(stats[1:count].tolist(), key=lambda s: -s[cv2.CC_STAT_AREA])
+    return [tuple(s[:4]) for s in found if s[cv2.CC_STAT_AREA] >= _MIN_REGION_PX][:3]
