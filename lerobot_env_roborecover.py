@@ -9,4 +9,5 @@ if note := lerobot_note():
     logging.getLogger(__name__).warning(note)
 
 import lerobot_roborecover.plugin
-import lerobot_roborecover.robot.lab.config_lab_robot  # noqa: F401 - register types
+import lerobot_roborecover.robot.lab.config_lab_robot
+import lerobot_roborecover.robot.lab.configuration_lab_pusher  # noqa: F401 - register types

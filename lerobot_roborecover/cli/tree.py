@@ -35,6 +35,7 @@ GROUPS = {
     "dataset": "Scenario datasets: look into them, move them to and from the Hub.",
     "curate": "Make scenarios, and training data, from rollouts.",
     "detect": "Monitors and failure detectors: their data, their measures, when to intervene.",
+    "robot": "Real robots: back to a recovery point, and compare policies from there.",
     "check": "Check a policy or a platform before hours are spent on it.",
 }
 
@@ -73,6 +74,11 @@ COMMANDS = (
     Command("detect evaluate", "detect_evaluate", "Compare detectors on a policy's own trials."),
     Command("detect evaluate-frames", "detect_evaluate_frames", "Measure a monitor on labelled frames."),
     Command("detect fork", "fork", "Continue logged trials in several ways: counterfactuals.", "fork"),
+    Command("robot capture", "robot_capture", "Run a policy, record it, mark where it goes wrong."),
+    Command("robot points", "robot_points", "Make recovery points of recorded episodes."),
+    Command("robot restore", "robot_restore", "Put robot and scene back; measure how far off."),
+    Command("robot run", "robot_run", "Run a plan of points and policies, blind."),
+    Command("robot rate", "robot_rate", "Rate recorded trials a second time, blind."),
     Command("check policy", "check_policy", "Try a policy for a few steps.", "check-policy"),
     Command("check platform", "check_platform", "Check that states are rebuilt exactly.", "check-platform"),
 )  # fmt: skip

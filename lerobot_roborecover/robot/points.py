@@ -59,6 +59,8 @@ class RobotPoint:
     frame: int
     quasi_static: bool
     """People have said that nothing was falling, sliding, or held by friction alone."""
+    boxes: Mapping[str, Any] = field(default_factory=dict)
+    """Left, top, width and height of the objects by camera, as people have drawn them."""
     truth: Mapping[str, Any] = field(default_factory=dict)
     """The simulated lab's own state at the point, for its operator alone; empty on a real robot."""
 
@@ -92,6 +94,7 @@ def make_point(
     episode: int,
     quasi_static: bool,
     truth: Mapping[str, Any] | None = None,
+    boxes: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """The scenario of a recovery point.
@@ -114,6 +117,7 @@ def make_point(
         episode: its number.
         quasi_static: whether everything was at rest.
         truth: of the simulated lab.
+        boxes: left, top, width and height of the objects by camera, as people have drawn them.
         provenance: further notes.
 
     Raises:
@@ -139,6 +143,7 @@ def make_point(
         "quasi_static": bool(quasi_static),
         "approach": np.round(np.asarray(approach, np.float64), 5).tolist(),
         **({"truth": dict(truth)} if truth else {}),
+        **({"boxes": dict(boxes)} if boxes else {}),
     }
     scenario = Scenario(
         id=id,
@@ -204,6 +209,7 @@ def _parse(scenario: Scenario) -> RobotPoint:
         episode=int(notes["episode"]),
         frame=int(notes["frame"]),
         quasi_static=notes["quasi_static"],
+        boxes={str(c): [[int(v) for v in box] for box in b] for c, b in notes.get("boxes", {}).items()},
         truth=dict(notes.get("truth", {})),
     )
 

@@ -25,7 +25,7 @@ LEROBOTS = {
     *(f"--{name}" for name in ("engine", "videos", "limit-seconds", "sequential", "shard", "retry")),
 }  # fmt: skip
 """LeRobot's own of `lerobot-eval`, and the short names that `roborecover eval` adds."""
-NESTED = ("--env.", "--policy.", "--eval.", "--runner.", "--check.")
+NESTED = ("--env.", "--policy.", "--eval.", "--runner.", "--check.", "--robot.", "--teleop.")
 """Beginnings of options that LeRobot's parser reads, which refuses unknown ones itself."""
 NAVIGATION = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
 PYTHON = all_blocks("python")

@@ -59,6 +59,7 @@ def lerobots_options() -> dict[str, Options]:
     )
     from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
     from lerobot_roborecover.policies.remote.serve import ServeConfig
+    from lerobot_roborecover.robot.commands import CaptureConfig, PlanRunConfig, RestoreConfig
 
     short = {f"--{name}": {"stands_for": f"--{long}"} for name, long in ALIASES.items()}
     check = {name: {"stands_for": long} for name, long in SHORT.items()}
@@ -66,6 +67,9 @@ def lerobots_options() -> dict[str, Options]:
         "eval": _of_class(RunnerOptions, "--runner.") | _of_class(RecoveryOptions, "--env.") | short,
         "check policy": _of_class(CheckOptions, "--check.") | check,
         "serve": _of_class(ServeConfig, "--"),
+        "robot capture": _of_class(CaptureConfig, "--"),
+        "robot restore": _of_class(RestoreConfig, "--"),
+        "robot run": _of_class(PlanRunConfig, "--"),
         **{
             f"--env.type={ENV_PREFIX}{name}": _of_class(ENV_TYPES[name], "--env.", RecoveryOptions)
             for name in ("fake", "lerobot", "libero", "metaworld", "robotwin")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.robot.console import Answer
 from lerobot_roborecover.robot.lab.lab_robot import LabRobot
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -35,7 +36,9 @@ class SimulatedOperator:
         self._rng = np.random.default_rng(seed)
         self._sd_mm = robot.config.placing_sd_mm if sd_mm is None else sd_mm
         self._bias_mm, self._max_tries = np.array(bias_mm, float), max_tries
-        self._tries = 0
+        self._tries = self._polls = 0
+        self.mark_after = 12
+        """Control steps into an episode at which a moment is marked while it is captured."""
         self.true_errors_mm: list[float] = []
         """How far each placing was really off."""
 
@@ -64,6 +67,38 @@ class SimulatedOperator:
         turn_rad = float(self._rng.normal(0.0, 0.05)) if self._sd_mm else 0.0
         self.robot.world.place(dict(truth["objects"]), offset_mm / 1000, turn_rad)
         self.true_errors_mm.append(1000 * self.robot.world.distance_m(dict(truth["objects"])))
+
+    def answer(self, screen: str, details: dict[str, Any]) -> Answer | None:
+        """What the operator presses on a screen of the run; nothing while a policy runs, until it is done."""
+        if screen == "clear":
+            self.clear()
+            return Answer("go")
+        if screen == "place":
+            if self.gives_up():
+                return Answer("skip")
+            self.place(details["truth"])
+            return Answer("done")
+        if screen == "confirm":
+            return Answer("yes")
+        if screen == "capturing":
+            return self._mark()
+        if screen == "running":
+            return Answer("success") if self.robot.world.succeeded() else None
+        if screen == "verdict":
+            return Answer(self.verdict())
+        if screen == "next":
+            return Answer("go")
+        return None
+
+    def _mark(self) -> Answer | None:
+        """Marks a moment some way into each episode, and ends it a little later."""
+        self._polls += 1
+        if self._polls == self.mark_after:
+            return Answer("mark")
+        if self._polls > self.mark_after + 5:
+            self._polls = 0
+            return Answer("end")
+        return None
 
     def gives_up(self) -> bool:
         """Whether enough placings were tried."""

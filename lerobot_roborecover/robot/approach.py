@@ -1,0 +1,133 @@
+"""Brings a robot's joints back along a recorded approach: slowly, within limits, stopped on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_roborecover.robot.clock import clock_of
+from lerobot_roborecover.robot.connection import RobotError, asking, limits_of, positions
+from lerobot_roborecover.robot.points import RobotPoint
+
+_RATE_HZ = 20.0
+
+
+class StoppedError(RobotError):
+    """A person has stopped the robot."""
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """How fast and how far joints may move, in the robot's units (degrees on an SO-101)."""
+
+    speed: float = 15.0
+    """Of the fastest joint, units a second."""
+    max_detour: float = 10.0
+    """Farthest that a joint may be from the recorded approach before a person is asked whether the straight
+    way there is free."""
+    tolerance: float = 2.0
+    """How near each joint has to come to the recovery point."""
+    max_lag: float = 25.0
+    """A joint that is farther than this from its target is blocked: the robot stops."""
+    settle_s: float = 3.0
+    """How long joints may take to come near, at the end."""
+
+
+def move_to(
+    robot: Any,
+    point: RobotPoint,
+    config: MotionConfig,
+    *,
+    stopped: Callable[[], bool],
+    confirm: Callable[[str], bool],
+    given: Mapping[str, tuple[float, float]] | None = None,
+) -> dict[str, float]:
+    """Moves the joints to a recovery point along its approach.
+
+    Args:
+        robot: connected.
+        point: checked by `check_point`.
+        config: speeds and limits.
+        stopped: asked before each small step; True leaves the robot where it is.
+        confirm: asks a person a yes-or-no question.
+        given: limits from the user.
+
+    Returns:
+        Measured minus recorded position by joint.
+
+    Raises:
+        StoppedError: a person stopped it, or did not confirm.
+        RobotError: a joint is blocked, or does not come near.
+    """
+    names = list(point.joints)
+    bounds = np.array([limits_of(robot, given)[n] for n in names])
+    here = _measure(robot, names)
+    path = point.approach
+    gaps = np.abs(path - here).max(1)
+    start = int(gaps.argmin())
+    if gaps[start] > config.max_detour:
+        start = 0
+        worst = names[int(np.abs(path[0] - here).argmax())]
+        if not confirm(
+            f"The arm is {gaps.min():.0f} {point.units.get(worst) or 'units'} off the recorded approach "
+            f"({worst.removesuffix('.pos')}). Is a straight way to its start free?"
+        ):
+            raise StoppedError("the straight way to the approach was not confirmed; move the arm by hand")
+    for waypoint in path[start:]:
+        here = _follow(robot, names, here, waypoint, bounds, config, stopped)
+    clock = clock_of(robot)
+    until = clock.now() + config.settle_s
+    goal = path[-1]
+    while True:
+        error = _measure(robot, names) - goal
+        if np.abs(error).max() <= config.tolerance or clock.now() > until:
+            break
+        _send(robot, names, goal, stopped)
+        clock.sleep(1 / _RATE_HZ)
+    return dict(zip(names, error.tolist(), strict=True))
+
+
+def _follow(
+    robot: Any,
+    names: list[str],
+    start: np.ndarray,
+    goal: np.ndarray,
+    bounds: np.ndarray,
+    config: MotionConfig,
+    stopped: Callable[[], bool],
+) -> np.ndarray:
+    """Takes small steps from the last target to the next one; returns it."""
+    if (goal < bounds[:, 0]).any() or (goal > bounds[:, 1]).any():
+        raise RobotError("a target lies outside the calibrated limits; the robot was stopped")
+    steps = max(int(np.ceil(np.abs(goal - start).max() / config.speed * _RATE_HZ)), 1)
+    clock = clock_of(robot)
+    for step in range(1, steps + 1):
+        target = start + (goal - start) * step / steps
+        _send(robot, names, target, stopped)
+        clock.sleep(1 / _RATE_HZ)
+        lag = np.abs(_measure(robot, names) - target)
+        if lag.max() > config.max_lag:
+            worst = int(lag.argmax())
+            raise RobotError(
+                f"joint {names[worst]} is {lag[worst]:.0f} from its target, at most {config.max_lag:g}: it "
+                "is blocked, or its torque is off. The robot was stopped; look at it before going on"
+            )
+    return goal
+
+
+def _send(robot: Any, names: list[str], target: np.ndarray, stopped: Callable[[], bool]) -> None:
+    if stopped():
+        raise StoppedError("stopped by a person; the arm stays where it is")
+    with asking(robot):
+        observation = robot.get_observation() if set(names) != set(robot.action_features) else {}
+        still = {n: float(observation[n]) for n in robot.action_features if n in observation}
+        robot.send_action({**still, **dict(zip(names, target.tolist(), strict=True))})
+
+
+def _measure(robot: Any, names: list[str]) -> np.ndarray:
+    with asking(robot):
+        found = positions(robot, robot.get_observation())
+    return np.array([found[n] for n in names])

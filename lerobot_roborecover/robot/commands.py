@@ -1,0 +1,290 @@
+"""The commands that drive a robot: their options beside LeRobot's own, and what they set up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.robots import RobotConfig
+from lerobot.rollout.inference import InferenceEngineConfig, SyncInferenceConfig
+from lerobot.teleoperators import TeleoperatorConfig
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.approach import MotionConfig
+from lerobot_roborecover.robot.connection import asking, connected
+from lerobot_roborecover.robot.console import Console
+from lerobot_roborecover.robot.start_check import Tolerance
+
+KEYS = {
+    "space": "stop", "g": "go", "k": "skip", "y": "yes", "n": "no", "d": "done", "s": "success",
+    "f": "failure", "i": "invalid", "u": "undo", "p": "pause", "m": "mark", "e": "end",
+    "t": "takeover", "h": "handback",
+}  # fmt: skip
+"""Button by key of the terminal."""
+
+
+@dataclass
+class RobotSession:
+    """What every command with a robot takes."""
+
+    robot: RobotConfig
+    """LeRobot's own configuration of the robot and its cameras."""
+    teleop: TeleoperatorConfig | None = None
+    """LeRobot's own configuration of a teleoperator, for takeovers."""
+    console_host: str = "127.0.0.1"
+    """Where the console is served; 0.0.0.0 lets a phone on the same network in."""
+    console_port: int = 8734
+    """0 takes a free port."""
+    tls_certificate: Path | None = None
+    """PEM certificate that makes the console https."""
+    tls_key: Path | None = None
+    """PEM key of the certificate."""
+    limits: dict[str, list[float]] = field(default_factory=dict)
+    """Lowest and highest position by joint, narrower than the calibrated ones."""
+    operator: str = ""
+    """`simulated` has the simulated lab put objects back and judge by itself; empty asks people."""
+
+    def __post_init__(self) -> None:
+        for name, values in self.limits.items():
+            if len(values) != 2 or not all(map(math.isfinite, values)) or values[0] >= values[1]:
+                raise OptionError(f"--limits: {name}: {values} is not a lowest and a highest position")
+        if self.operator not in ("", "simulated"):
+            raise OptionError(f"--operator={self.operator}: not 'simulated', and not empty")
+
+    @property
+    def joint_limits(self) -> dict[str, tuple[float, float]]:
+        """`limits` as pairs."""
+        return {name: (values[0], values[1]) for name, values in self.limits.items()}
+
+
+@dataclass
+class CaptureConfig(RobotSession):
+    """Options of `roborecover robot capture`."""
+
+    dataset: Path = Path("outputs/robot/capture")
+    """Folder of the LeRobotDataset; extended where it is there."""
+    instruction: str = ""
+    """What the policy is told."""
+    episodes: int = 10
+    """How many to record."""
+    limit_s: float = 30.0
+    """Time limit of each, seconds."""
+    fps: float = 30.0
+    """Control steps a second."""
+    rename_map: dict[str, str] = field(default_factory=dict)
+    """The robot's observation keys to the policy's."""
+    inference: InferenceEngineConfig = field(default_factory=SyncInferenceConfig)
+    """LeRobot's inference engine: sync or rtc."""
+
+
+@dataclass
+class RestoreConfig(RobotSession):
+    """Options of `roborecover robot restore`."""
+
+    points: Path = Path("outputs/robot/points")
+    """Set of recovery points."""
+    point: str = ""
+    """Id of the point; empty takes the set's first."""
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+
+
+@dataclass
+class PlanRunConfig(RobotSession):
+    """Options of `roborecover robot run`."""
+
+    plan: Path = Path("plan.yaml")
+    """Points, policies, repeats and seed."""
+    out: Path = Path("outputs/robot/run")
+    """Folder of the run; the same one goes on where it stopped."""
+    rater: str = ""
+    """Who gives the verdicts; a pseudonym."""
+    stop_after: int = 0
+    """End after so many trials; 0 goes on to the plan's end."""
+    inference: InferenceEngineConfig = field(default_factory=SyncInferenceConfig)
+    """LeRobot's inference engine: sync or rtc."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """A connected robot with its console."""
+
+    robot: Any
+    console: Console
+    teleop: Any
+
+
+@contextmanager
+def session(config: RobotSession) -> Generator[Session]:
+    """Connects the robot, and serves the console on phone and keyboard, for a block."""
+    from lerobot.teleoperators import make_teleoperator_from_config
+
+    from lerobot_roborecover.robot.phone.server import Phone, PhoneConfig
+
+    with ExitStack() as stack:
+        robot = stack.enter_context(connected(config.robot))
+        teleop = None
+        if config.teleop is not None:
+            teleop = make_teleoperator_from_config(config.teleop)
+            with asking(teleop):
+                teleop.connect()
+            stack.callback(teleop.disconnect)
+        console = Console(_operator(config, robot))
+        if not config.operator:
+            phone = Phone(
+                console,
+                PhoneConfig(config.console_host, config.console_port, config.tls_certificate, config.tls_key),
+            )
+            stack.callback(phone.close)
+            listener = _keyboard(console)
+            if listener is not None:
+                stack.callback(listener.stop)
+        yield Session(robot, console, teleop)
+
+
+def _operator(config: RobotSession, robot: Any) -> Any:
+    if not config.operator:
+        return None
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    if not hasattr(robot, "world"):
+        raise OptionError(
+            f"--operator=simulated: robot {robot.name} is real, and a person has to put its objects back. "
+            "Leave the option out"
+        )
+    return SimulatedOperator(robot, seed=robot.config.seed)
+
+
+def _keyboard(console: Console) -> Any:
+    """Listens to the terminal's keys, where there is a terminal."""
+    import sys
+
+    if not sys.stdin or not sys.stdin.isatty():
+        return None
+    from lerobot.utils.keyboard_input import create_key_listener
+
+    words = ", ".join(f"{key}={button}" for key, button in KEYS.items())
+
+    def pressed(name: str) -> None:
+        if name in KEYS:
+            console.press(KEYS[name])
+
+    return create_key_listener(pressed, controls_help=words)
+
+
+def policy_arguments(argv: Sequence[str]) -> tuple[str, list[str], list[str]]:
+    """Takes `--policy.*` out of a command line.
+
+    Args:
+        argv: the arguments.
+
+    Returns:
+        The checkpoint, the options of its configuration as LeRobot takes them, and all other arguments.
+
+    Raises:
+        OptionError: no checkpoint is named.
+    """
+    path, overrides, rest = "", [], []
+    words = iter(argv)
+    for word in words:
+        if not word.startswith("--policy."):
+            rest.append(word)
+            continue
+        name, equals, value = word.removeprefix("--policy.").partition("=")
+        value = value if equals else next(words, "")
+        if name == "path":
+            path = value
+        else:
+            overrides.append(f"--{name}={value}")
+    if not path and not {"-h", "--help"} & set(argv):
+        raise OptionError("--policy.path: name the policy that runs, a checkpoint folder or a Hub id")
+    return path, overrides, rest
+
+
+def run_capture(argv: Sequence[str]) -> int:
+    """`roborecover robot capture`."""
+    from lerobot_roborecover.policies.command_line import run_with_arguments
+    from lerobot_roborecover.robot.capture import capture
+    from lerobot_roborecover.robot.policies import load_context
+    from lerobot_roborecover.utils.text import next_command
+
+    path, overrides, rest = policy_arguments(argv)
+
+    def command(config: CaptureConfig) -> int:
+        with session(config) as made:
+            instruction = config.instruction or getattr(made.robot, "instruction", "")
+            if not instruction:
+                raise OptionError("--instruction: say what the policy is to do")
+            context = load_context(
+                made.robot, path, fps=config.fps, instruction=instruction, overrides=overrides,
+                rename_map=config.rename_map, inference=config.inference,
+            )  # fmt: skip
+            marked = capture(
+                made.robot, context, config.dataset, made.console, episodes=config.episodes,
+                limit_s=config.limit_s, instruction=instruction, teleop=made.teleop,
+            )  # fmt: skip
+        if marked:
+            print(next_command(["robot", "points", str(config.dataset), "--out", "POINTS"]))
+        return 0
+
+    command.__annotations__["config"] = CaptureConfig
+    return run_with_arguments(command, "roborecover robot capture", rest)
+
+
+def run_restore(argv: Sequence[str]) -> int:
+    """`roborecover robot restore`: exit status 1 where the start is outside the tolerance."""
+    from lerobot_roborecover.policies.command_line import run_with_arguments
+    from lerobot_roborecover.robot.points import read_points
+    from lerobot_roborecover.robot.restore import restore
+
+    def command(config: RestoreConfig) -> int:
+        points = read_points(config.points, [config.point] if config.point else [])
+        with session(config) as made:
+            found = restore(
+                made.robot, points, points.points[0], made.console, motion=config.motion,
+                tolerance=config.tolerance, limits=config.joint_limits,
+            )  # fmt: skip
+        print(f"{points.points[0].id}: {found.reset_s:.0f} s, {found.attempts} measured")
+        if found.error is not None:
+            print(f"joints {found.error.worst('joint') or 0:.2f} off")
+            for name, camera in found.error.cameras.items():
+                values = {"camera": camera.background_px, "objects": camera.object_px}
+                said = ", ".join(f"{k} {v:.1f} px" for k, v in values.items() if v is not None)
+                print(f"{name}: {said or 'no number'}")
+        print(found.reason or "the start is within the tolerance")
+        return 1 if found.reason else 0
+
+    command.__annotations__["config"] = RestoreConfig
+    return run_with_arguments(command, "roborecover robot restore", argv)
+
+
+def run_plan(argv: Sequence[str]) -> int:
+    """`roborecover robot run`."""
+    from lerobot_roborecover.policies.command_line import run_with_arguments
+    from lerobot_roborecover.robot.plan import lock_plan, read_plan
+    from lerobot_roborecover.robot.run import RobotRun, RunConfig
+    from lerobot_roborecover.robot.run_journal import RunJournal
+    from lerobot_roborecover.utils.text import next_command
+
+    def command(config: PlanRunConfig) -> int:
+        if not config.rater:
+            raise OptionError("--rater: say who gives the verdicts, a name or a pseudonym")
+        locked, points = lock_plan(read_plan(config.plan), config.out)
+        journal = RunJournal(config.out)
+        try:
+            with session(config) as made:
+                how = RunConfig(
+                    config.out, config.rater, config.joint_limits, config.inference, config.stop_after
+                )
+                RobotRun(made.robot, locked, points, journal, made.console, how, made.teleop).run()
+        finally:
+            journal.close()
+        print(next_command(["report", str(journal.log), "--out", "REPORT"]))
+        return 0
+
+    command.__annotations__["config"] = PlanRunConfig
+    return run_with_arguments(command, "roborecover robot run", argv)

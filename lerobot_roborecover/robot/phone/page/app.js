@@ -1,0 +1,153 @@
+// The console on a phone: asks the server what to show, and tells it what was pressed.
+
+const byId = (id) => document.getElementById(id);
+const VIEWS = ["blend", "difference", "edges", "recorded", "live"];
+const WORDS = {
+  go: "Go", skip: "Skip", yes: "Yes", no: "No", done: "Done", success: "Success", failure: "Failure",
+  invalid: "Invalid", undo: "Undo last verdict", pause: "Pause", mark: "Mark: it went wrong", end: "End",
+  takeover: "Take over", handback: "Hand back",
+};
+let view = "blend";
+let shown = -1;
+let inside = false;
+
+async function send(path, body) {
+  const answer = await fetch(`api/${path}`, {
+    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+  });
+  const said = await answer.json();
+  if (!answer.ok) throw Object.assign(new Error(said.error), { status: answer.status });
+  return said;
+}
+
+function complain(error) {
+  byId("message").textContent = error ? error.message : "";
+}
+
+async function enter(takeOver) {
+  try {
+    await send("enter", { code: byId("code").value.trim(), take_over: takeOver });
+    complain(null);
+    byId("take-over").hidden = true;
+    inside = true;
+    shown = -1;
+  } catch (error) {
+    byId("take-over").hidden = error.status !== 409;
+    complain(error);
+  }
+}
+
+async function press(button) {
+  try {
+    await send("press", { button, reason: byId("reason").value, note: byId("note").value });
+    complain(null);
+  } catch (error) {
+    complain(error);
+  }
+}
+
+function button(name, text, action) {
+  const made = document.createElement("button");
+  made.textContent = text;
+  made.dataset.name = name;
+  made.addEventListener("click", action);
+  return made;
+}
+
+function showScreen(state) {
+  document.body.dataset.screen = state.name;
+  byId("instruction").textContent = state.details.instruction || "";
+  byId("buttons").replaceChildren(
+    ...state.buttons.map((name) => button(name, WORDS[name] || name, () => press(name))),
+  );
+  const verdict = state.buttons.includes("invalid");
+  byId("note-label").hidden = byId("reason-label").hidden = !verdict;
+  byId("note").value = "";
+  byId("reason").replaceChildren(...(state.details.reasons || []).map((r) => new Option(r, r)));
+}
+
+function showPictures(state) {
+  const placing = ["place", "rate"].includes(state.name) ? state.cameras : [];
+  byId("views").hidden = state.name !== "place";
+  const errors = (state.details.start_error || {}).cameras || {};
+  const figures = placing.map((camera) => {
+    const figure = byId("cameras").querySelector(`[data-camera="${camera}"]`) || document.createElement("figure");
+    if (!figure.dataset.camera) {
+      figure.dataset.camera = camera;
+      figure.append(new Image(), document.createElement("figcaption"));
+      figure.firstChild.alt = `Ghost of camera ${camera}`;
+    }
+    figure.firstChild.src = `api/ghost/${encodeURIComponent(camera)}/${state.name === "rate" ? "live" : view}?${Date.now()}`;
+    const found = errors[camera] || {};
+    const said = [
+      ["camera", found.background_px, "px"], ["objects", found.object_px, "px"], ["tags", found.tag_mm, "mm"],
+    ].filter(([, value]) => value !== null && value !== undefined);
+    const numbers = said.map(([what, value, unit]) => `${what} ${value.toFixed(1)} ${unit}`).join(", ");
+    figure.lastChild.textContent = state.name === "rate" ? camera : `${camera}: ${numbers || "no number"}`;
+    const bad = ((state.details.start_error || {}).problems || []).some((p) => p.includes(`camera ${camera}:`));
+    figure.lastChild.className = bad ? "bad" : "good";
+    return figure;
+  });
+  byId("cameras").replaceChildren(...figures);
+  const problems = (state.details.start_error || {}).problems || [];
+  byId("problems").replaceChildren(...problems.map((text) => {
+    const item = document.createElement("li");
+    item.textContent = text;
+    return item;
+  }));
+}
+
+async function look() {
+  if (inside) {
+    try {
+      const answer = await fetch("api/state");
+      const state = await answer.json();
+      if (!answer.ok) throw new Error(state.error);
+      byId("text").textContent = state.stopped ? "STOPPED" : state.text;
+      if (state.version !== shown) showScreen(state);
+      shown = state.version;
+      showPictures(state);
+    } catch (error) {
+      complain(error);
+      if (!(error instanceof TypeError)) inside = false; // a TypeError is a network that is away
+    }
+  } else {
+    byId("text").textContent = "RoboRecover: console of the robot";
+    document.body.dataset.screen = "door";
+  }
+  byId("door").hidden = inside;
+  byId("inside").hidden = !inside;
+  setTimeout(look, document.body.dataset.screen === "rate" ? 250 : 500);
+}
+
+byId("door").addEventListener("submit", (event) => {
+  event.preventDefault();
+  enter(false);
+});
+byId("take-over").addEventListener("click", () => enter(true));
+byId("stop").addEventListener("click", () => press("stop"));
+byId("leave").addEventListener("click", async () => {
+  try {
+    await send("leave", {});
+    inside = false;
+  } catch (error) {
+    complain(error);
+  }
+});
+document.addEventListener("keydown", (event) => {
+  if (event.code === "Space" && event.target.tagName !== "INPUT") {
+    event.preventDefault();
+    press("stop");
+  }
+});
+byId("views").replaceChildren(...VIEWS.map((name) => {
+  const made = button(name, name, () => {
+    view = name;
+    for (const other of byId("views").children) other.setAttribute("aria-pressed", other.dataset.name === view);
+  });
+  made.setAttribute("aria-pressed", name === view);
+  return made;
+}));
+fetch("api/state").then((answer) => {
+  inside = answer.ok;
+}).finally(look);

@@ -1,0 +1,263 @@
+"""Serves the console to a phone: one at a time, let in by a one-time code that the terminal shows.
+
+On a lab's own network the server listens on every address (`--host 0.0.0.0`), so that a phone reaches it. A
+page elsewhere cannot use it: requests must name one of the server's addresses, and changes must come from the
+page itself. With `tls` the traffic is encrypted; without, it can be read by others on the network.
+"""
+
+from __future__ import annotations
+
+import hmac
+import io
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.routing import Route
+
+from lerobot_roborecover.robot.console import Console
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.web.guard import Refusal, guarded, read_body
+from lerobot_roborecover.web.page import PageFiles
+from lerobot_roborecover.web.serve import make_server
+
+COOKIE = "roborecover_console"
+MAX_TRIES = 5
+VIEWS = ("blend", "difference", "edges", "recorded", "live")
+_PAGE = PageFiles("lerobot_roborecover.robot.phone", "app.js")
+
+
+class Door:
+    """Lets one phone in at a time.
+
+    Args:
+        say: takes the code, for the terminal.
+    """
+
+    def __init__(self, say: Callable[[str], None]):
+        self._say, self._lock = say, threading.Lock()
+        self._token, self._tries = "", 0
+        self._new_code()
+
+    def _new_code(self) -> None:
+        self.code, self._tries = f"{secrets.randbelow(10**6):06d}", 0
+        self._say(f"code for the phone: {self.code}")
+
+    def enter(self, code: str, take_over: bool) -> str:
+        """Exchanges a code for a token.
+
+        Args:
+            code: as typed.
+            take_over: put another phone out that is in.
+
+        Raises:
+            Refusal: the code is wrong, or another phone is in.
+        """
+        with self._lock:
+            if not hmac.compare_digest(code.encode(), self.code.encode()):
+                self._tries += 1
+                if self._tries >= MAX_TRIES:
+                    self._new_code()
+                raise Refusal(403, "this is not the code that the terminal shows")
+            if self._token and not take_over:
+                raise Refusal(409, "another phone is the console; take over, or use that one")
+            self._token = secrets.token_urlsafe(24)
+            self._new_code()
+            return self._token
+
+    def check(self, token: str) -> None:
+        """Refuses a token that is not the present phone's.
+
+        Raises:
+            Refusal: it is none, or another phone has taken over.
+        """
+        if not self._token or not hmac.compare_digest(token.encode(), self._token.encode()):
+            raise Refusal(403, "another phone has taken over, or this one was never let in")
+
+    def leave(self) -> None:
+        """Lets the present phone out."""
+        self._token = ""
+
+
+@dataclass(frozen=True)
+class PhoneConfig:
+    """Where the page is served."""
+
+    host: str = "127.0.0.1"
+    """`0.0.0.0` lets a phone on the same network in."""
+    port: int = 8734
+    """0 takes a free one."""
+    tls_certificate: Path | None = None
+    """PEM file; with its key, the page is served as https."""
+    tls_key: Path | None = None
+
+
+def make_app(console: Console, door: Door, hosts: frozenset[str], scheme: str = "http") -> Any:
+    """The application.
+
+    Args:
+        console: what is served.
+        door: who is let in.
+        hosts: Host headers that name this server.
+        scheme: `http` or `https`.
+    """
+
+    def inside(request: Request) -> None:
+        door.check(request.cookies.get(COOKIE, ""))
+        origin = request.headers.get("origin")
+        if request.method == "POST" and origin not in (None, f"{scheme}://{request.headers.get('host')}"):
+            raise Refusal(403, "this request does not come from the page")
+        console.heard()
+
+    async def page(request: Request) -> Response:
+        return _PAGE.response(request.path_params.get("file", ""))
+
+    async def enter(request: Request) -> Response:
+        sent = await read_body(request)
+        token = door.enter(str(sent.get("code", "")), sent.get("take_over") is True)
+        console.heard()
+        answer = JSONResponse({"inside": True})
+        answer.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=scheme == "https")
+        return answer
+
+    async def state(request: Request) -> Response:
+        inside(request)
+        found = console.state()
+        details = {k: v for k, v in found["details"].items() if k != "truth"}
+        return JSONResponse({**found, "details": details})
+
+    async def press(request: Request) -> Response:
+        inside(request)
+        sent = await read_body(request)
+        values = {k: str(v) for k, v in sent.items() if k in ("reason", "note")}
+        if not console.press(str(sent.get("button", "")), values):
+            raise Refusal(409, "this button is not on the present screen any more")
+        return JSONResponse({"taken": True})
+
+    async def leave(request: Request) -> Response:
+        inside(request)
+        door.leave()
+        console.leave()
+        return JSONResponse({"inside": False})
+
+    async def ghost(request: Request) -> Response:
+        inside(request)
+        pair = console.pictures.get(request.path_params["camera"])
+        view = request.path_params["view"]
+        if pair is None or view not in VIEWS:
+            raise Refusal(404, "there is no such picture yet")
+        data = await run_in_threadpool(_jpeg, pair, view)
+        return Response(data, media_type="image/jpeg")
+
+    async def refuse(_request: Request, err: Exception) -> Response:
+        assert isinstance(err, Refusal)
+        return JSONResponse({"error": err.message}, err.status)
+
+    async def home(_request: Request) -> Response:
+        return RedirectResponse("/console/", 303)
+
+    routes = [
+        Route("/", home),
+        Route("/console/", page),
+        Route("/console/api/enter", enter, methods=["POST"]),
+        Route("/console/api/state", state),
+        Route("/console/api/press", press, methods=["POST"]),
+        Route("/console/api/leave", leave, methods=["POST"]),
+        Route("/console/api/ghost/{camera}/{view}", ghost),
+        Route("/console/{file}", page),
+    ]
+    app = Starlette(routes=routes, exception_handlers={Refusal: refuse})
+    app.router.redirect_slashes = False
+    return guarded(app, hosts)
+
+
+class Phone:
+    """Serves a console in a thread until it is closed.
+
+    Args:
+        console: what is served.
+        config: where.
+        say: takes the address and the code.
+
+    Raises:
+        ScenarioError: the port is taken, or the certificate cannot be used.
+    """
+
+    def __init__(self, console: Console, config: PhoneConfig, say: Callable[[str], None] = print):
+        self._listener = _listen(config.host, config.port)
+        port = self._listener.getsockname()[1]
+        scheme = "https" if config.tls_certificate else "http"
+        names = {config.host, "127.0.0.1", "localhost"}
+        if config.host == "0.0.0.0":
+            names |= {_own_address(), socket.gethostname()}
+        names.discard("0.0.0.0")
+        hosts = frozenset(f"{name}:{port}" for name in names)
+        shown = _own_address() if config.host == "0.0.0.0" else config.host
+        self.address = f"{scheme}://{shown}:{port}/console/"
+        say(f"console: {self.address}")
+        self.door = Door(say)
+        app = make_app(console, self.door, hosts, scheme)
+        self._server = make_server(app)
+        if config.tls_certificate:
+            try:
+                self._server.config.ssl_certfile = str(config.tls_certificate)
+                self._server.config.ssl_keyfile = str(config.tls_key) if config.tls_key else None
+                self._server.config.load()
+            except (OSError, ValueError) as err:
+                self._listener.close()
+                raise ScenarioError(f"--tls_certificate={config.tls_certificate}: {err}") from None
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._listener]}, daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the server."""
+        self._server.should_exit = True
+        self._thread.join(5.0)
+        self._listener.close()
+
+
+def _jpeg(pair: tuple[np.ndarray, np.ndarray], view: str) -> bytes:
+    from PIL import Image
+
+    from lerobot_roborecover.robot.vision import ghost
+
+    buffer = io.BytesIO()
+    Image.fromarray(ghost(*pair, view)).save(buffer, "JPEG", quality=90)
+    return buffer.getvalue()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(32)
+    except (OSError, OverflowError) as err:
+        listener.close()
+        raise ScenarioError(
+            f"the console cannot be served at {host}:{port}: {err}. Name another port, or 0 for a free one"
+        ) from None
+    return listener
+
+
+def _own_address() -> str:
+    """This machine's address on its network; nothing is sent."""
+    probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    except OSError:
+        return "127.0.0.1"
+    finally:
+        probe.close()

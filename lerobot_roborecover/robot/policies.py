@@ -1,0 +1,80 @@
+"""LeRobot policies on a robot that stays connected: LeRobot's own rollout context, one a policy."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.connection import camera_names
+from lerobot_roborecover.utils.plugins import register_plugins
+
+
+def load_context(
+    robot: Any,
+    path: str,
+    *,
+    fps: float,
+    instruction: str,
+    overrides: Sequence[str] = (),
+    rename_map: Mapping[str, str] | None = None,
+    inference: Any = None,
+) -> Any:
+    """LeRobot's `RolloutContext` of a policy on a connected robot.
+
+    Args:
+        robot: connected; it stays so.
+        path: checkpoint folder or Hub id.
+        fps: control steps a second.
+        instruction: of the task.
+        overrides: of the policy's configuration, e.g. `--n_action_steps=5`.
+        rename_map: the robot's observation keys to the policy's.
+        inference: a LeRobot `InferenceEngineConfig`; by default synchronous.
+
+    Raises:
+        OptionError: the checkpoint cannot be loaded, or needs a camera that the robot does not have.
+    """
+    from lerobot.configs import FeatureType, PreTrainedConfig
+    from lerobot.rollout.configs import RolloutConfig
+    from lerobot.rollout.context import build_rollout_context
+    from lerobot.rollout.inference import SyncInferenceConfig
+
+    from lerobot_roborecover.policies.command_line import process_arguments
+    from lerobot_roborecover.robot.config_held_robot import HeldRobotConfig
+
+    register_plugins()
+    renamed = dict(rename_map or {})
+    try:
+        with process_arguments("roborecover robot", []):
+            config = PreTrainedConfig.from_pretrained(path, cli_overrides=list(overrides))
+            config.pretrained_path = path  # ty: ignore[invalid-assignment] - LeRobot sets text, too
+            provided = {f"observation.images.{name}" for name in camera_names(robot)}
+            provided = {renamed.get(key, key) for key in provided}
+            wanted = [k for k, f in (config.input_features or {}).items() if f.type is FeatureType.VISUAL]
+            if missing := [key for key in wanted if key not in provided]:
+                raise OptionError(
+                    f"policy {path} needs {missing[0]}; the robot has {', '.join(sorted(provided)) or 'none'}"
+                    ". Add the camera to --robot.cameras, or map one to it with rename_map"
+                )
+            rollout = RolloutConfig(
+                robot=HeldRobotConfig(robot=robot),
+                policy=config,
+                inference=inference or SyncInferenceConfig(),
+                fps=fps,
+                task=instruction,
+                rename_map=renamed,
+                return_to_initial_position=False,
+                play_sounds=False,
+            )
+            return build_rollout_context(rollout, threading.Event())
+    except (OSError, ValueError, KeyError, NotImplementedError) as err:
+        if isinstance(err, OptionError):
+            raise
+        raise OptionError(f"policy {path} cannot be loaded: {' '.join(str(err).split())[:300]}") from err
+
+
+def set_instruction(context: Any, instruction: str) -> None:
+    """Gives a policy's engine another instruction; LeRobot's own is fixed where the engine is made."""
+    assert hasattr(context.policy.inference, "_task")
+    context.policy.inference._task = instruction

@@ -1,0 +1,117 @@
+"""Puts robot and scene back to a recovery point: joints first, then the objects by hand, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot_roborecover.logs.robot import StartError
+from lerobot_roborecover.robot.approach import MotionConfig, StoppedError, move_to
+from lerobot_roborecover.robot.clock import clock_of
+from lerobot_roborecover.robot.connection import check_point
+from lerobot_roborecover.robot.console import Console
+from lerobot_roborecover.robot.points import PointSet, RobotPoint
+from lerobot_roborecover.robot.start_check import StartCheck, Tolerance
+
+_LIVE_S = 0.4
+"""Seconds between two measurements while a person puts things back."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """How a restoring went."""
+
+    error: StartError | None
+    """As measured last; None where it was stopped before."""
+    reset_s: float
+    attempts: int
+    reason: str = ""
+    """Why the trial may not be run; empty where it may."""
+
+
+def restore(
+    robot: Any,
+    points: PointSet,
+    point: RobotPoint,
+    console: Console,
+    *,
+    motion: MotionConfig | None = None,
+    tolerance: Tolerance | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> Restored:
+    """Puts robot and scene back to a recovery point.
+
+    Args:
+        robot: connected.
+        points: the set that the point is of.
+        point: where to.
+        console: asks the people.
+        motion: speeds.
+        tolerance: which start may be run.
+        limits: of joints, from the user.
+
+    Raises:
+        RobotError: the point is not this robot's, or the robot is blocked or lost.
+    """
+    check_point(point, robot, limits)
+    check = StartCheck(points, point, tolerance or Tolerance())
+    clock = clock_of(robot)
+    begun, attempts = clock.now(), 0
+    error: StartError | None = None
+
+    def over(reason: str = "") -> Restored:
+        return Restored(error, round(clock.now() - begun, 2), attempts, reason)
+
+    details = {"point": point.id, "instruction": point.scenario.task.instruction, "truth": dict(point.truth)}
+    said = console.ask(
+        "clear",
+        "Take the objects off the table and keep your hands away: the arm moves to where it was.",
+        ("go", "skip"),
+        details,
+    )
+    if said.button == "skip":
+        return over("skipped by the operator before the arm moved")
+    try:
+        console.show("moving", "The arm moves slowly. Stop it with the red button or Space.", (), details)
+        move_to(
+            robot,
+            point,
+            motion or MotionConfig(),
+            stopped=lambda: console.stopped or console.phone_gone,
+            confirm=lambda text: console.ask("confirm", text, ("yes", "no"), details).button == "yes",
+            given=limits,
+        )
+    except StoppedError as err:
+        return over(str(err))
+    last = float("-inf")
+
+    def look() -> None:
+        nonlocal error, last
+        if clock.now() - last < _LIVE_S:
+            return
+        error, live = check.measure(robot)
+        console.pictures = {c: (check.references[c].picture, p) for c, p in live.items()}
+        console.update(start_error=error.as_json())
+        last = clock.now()
+
+    while True:
+        last = float("-inf")
+        said = console.ask(
+            "place",
+            "Put the objects back until they cover the ghost, then take your hands away and press Done.",
+            ("done", "skip"),
+            {**details, "start_error": None if error is None else error.as_json()},
+            meanwhile=look,
+        )
+        if console.stopped:
+            return over("stopped by a person while objects were put back")
+        last = float("-inf")
+        look()
+        attempts += 1
+        assert error is not None
+        if said.button == "skip":
+            return over("; ".join(error.problems) or "skipped by the operator")
+        if not error.problems:
+            return over()
+        details = {**details, "problems": list(error.problems)}

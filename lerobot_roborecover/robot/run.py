@@ -1,0 +1,322 @@
+"""Runs a locked plan on a robot: restore, measure, roll out, ask for a verdict; trial after trial."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.logs.robot import RobotTrial, StartError
+from lerobot_roborecover.logs.row import EvalProtocol, RunExtent, TrialRow, make_row
+from lerobot_roborecover.robot.connection import RobotError, calibration_sha256, check_point
+from lerobot_roborecover.robot.console import Answer, Console
+from lerobot_roborecover.robot.plan import LockedPlan, PlannedPolicy, PlannedTrial
+from lerobot_roborecover.robot.points import PointSet, RobotPoint
+from lerobot_roborecover.robot.recorder import Recorder
+from lerobot_roborecover.robot.restore import restore
+from lerobot_roborecover.robot.run_journal import RunJournal
+from lerobot_roborecover.scenario import Outcome, Start
+from lerobot_roborecover.utils.text import pluralize
+
+MIN_FREE_BYTES = 2**28
+"""Room that has to be on the disk before a trial: its video may take that much."""
+MAX_CLOCK_JUMP_S = 2.0
+REASONS = ("robot", "camera", "person", "scene", "other")
+"""Why a person calls a trial invalid."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """How a plan is run."""
+
+    folder: Path
+    """Of the run: lock, journal, trial log, rollout dataset."""
+    rater: str
+    """Who gives the verdicts; a pseudonym."""
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Of joints, narrower than the calibrated ones."""
+    inference: Any = None
+    """LeRobot `InferenceEngineConfig`; None is synchronous."""
+    stop_after: int = 0
+    """End after so many trials; 0 goes on to the plan's end."""
+
+
+class RobotRun:
+    """A plan under way on a connected robot.
+
+    Args:
+        robot: connected; held for all policies.
+        plan: locked.
+        points: of the plan.
+        journal: of the run.
+        console: asks the people.
+        config: how.
+        teleop: a connected teleoperator for takeovers, or None.
+        say: takes lines for the terminal.
+    """
+
+    def __init__(
+        self,
+        robot: Any,
+        plan: LockedPlan,
+        points: PointSet,
+        journal: RunJournal,
+        console: Console,
+        config: RunConfig,
+        teleop: Any = None,
+        say: Callable[[str], None] = print,
+    ):
+        self.robot, self.plan, self.points, self.journal = robot, plan, points, journal
+        self.console, self.config, self.teleop, self.say = console, config, teleop, say
+        self._by_id = {p.id: p for p in points.points}
+        self._contexts: dict[str, Any] = {}
+        self._recorder: Recorder | None = None
+
+    def run(self) -> int:
+        """Runs what is left of the plan.
+
+        Returns:
+            How many trials have a verdict now.
+
+        Raises:
+            OptionError: a policy cannot be loaded, or needs a camera that is not there.
+            RobotError: a point is not this robot's, or the robot is lost; the run goes on where it stopped.
+            ScenarioError: something cannot be written.
+        """
+        for point in self._by_id.values():
+            check_point(point, self.robot, self.config.limits)
+        for name in self.plan.plan.policies:
+            self._context(name)
+        done = 0
+        pending = self.journal.pending()
+        if pending is not None:
+            self.say(f"trial {pending['order'] + 1} was run and has no verdict yet")
+            self._judge(self.plan.trials[pending["order"]], pending)
+            done += 1
+        while not self.config.stop_after or done < self.config.stop_after:
+            finished = self.journal.rows()
+            left = [t for t in self.plan.trials if t.order not in finished]
+            if not left:
+                break
+            trial = left[0]
+            said = self.console.ask(
+                "next",
+                f"Trial {trial.order + 1} of {len(self.plan.trials)}: policy {trial.code}.",
+                ("go", "undo", "pause"),
+                {"point": trial.point, "code": trial.code, "done": len(finished)},
+            )
+            if said.button == "pause":
+                break
+            if said.button == "undo":
+                self._undo()
+                continue
+            self.console.release()
+            self._trial(trial)
+            done += 1
+        total = len(self.journal.rows())
+        self.console.show("over", f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done.")
+        self.say(f"{pluralize(total, 'trial')} of {len(self.plan.trials)} in {self.journal.log}")
+        return total
+
+    def _undo(self) -> None:
+        """Takes the latest verdict back and asks for it again where the trial was rolled out."""
+        order = self.journal.undo()
+        pending = self.journal.pending()
+        if order is not None and pending is not None and pending["order"] == order:
+            self._judge(self.plan.trials[order], pending)
+
+    def _trial(self, trial: PlannedTrial) -> None:
+        free = shutil.disk_usage(self.config.folder).free
+        if free < MIN_FREE_BYTES:
+            raise RobotError(
+                f"{self.config.folder}: {free // 2**20} MB are free, a trial's video may need "
+                f"{MIN_FREE_BYTES // 2**20}. Make room, then start the same command again: nothing is lost"
+            )
+        point = self._by_id[trial.point]
+        restored = restore(
+            self.robot,
+            self.points,
+            point,
+            self.console,
+            motion=self.plan.plan.motion,
+            tolerance=self.plan.plan.tolerance,
+            limits=self.config.limits,
+        )
+        values = {
+            "order": trial.order,
+            "start_error": None if restored.error is None else restored.error.as_json(),
+            "reset_s": restored.reset_s,
+            "attempts": restored.attempts,
+        }
+        self.journal.note("restored", **values, reason=restored.reason)
+        if restored.reason:
+            row = self._row(trial, values, Outcome.STATE_MISMATCH, restored.reason, "invalid")
+            self.journal.finish(trial.order, row)
+            self.say(f"trial {trial.order + 1}: not run: {restored.reason}")
+            return
+        self._roll(trial, point, values)
+
+    def _roll(self, trial: PlannedTrial, point: RobotPoint, values: dict[str, Any]) -> None:
+        from lerobot_roborecover.robot.policies import set_instruction
+        from lerobot_roborecover.robot.rollout import RecordedRollout
+
+        context = self._context(trial.policy)
+        set_instruction(context, point.scenario.task.instruction)
+        recorder = self._recorder_of(context, point.fps)
+        rollout = RecordedRollout(
+            recorder, self.console, point.time_limit_s, point.scenario.task.instruction, self.teleop
+        )
+        buttons = ("success", "failure", "end", *(("takeover", "handback") if self.teleop else ()))
+        self.console.show(
+            "running",
+            f"Policy {trial.code} runs. Keep your hands away.",
+            buttons,
+            {"point": point.id, "code": trial.code, "limit_s": point.time_limit_s},
+        )
+        wall, steady = time.time(), time.monotonic()
+        try:
+            rollout.setup(context)
+            rollout.run(context)
+        finally:
+            rollout.teardown(context)
+        jump = (time.time() - wall) - (time.monotonic() - steady)
+        end = rollout.end
+        record = {
+            **values,
+            "steps": min(end.steps, point.scenario.task.horizon),
+            "duration_s": round(end.duration_s, 3),
+            "ended": end.ended,
+            "button": end.button,
+            "problem": end.problem,
+            "episode": end.episode,
+            "interventions": end.interventions,
+            "actions_sha256": end.actions_sha256,
+            "clock_jump_s": round(jump, 3) if abs(jump) > MAX_CLOCK_JUMP_S else 0.0,
+        }
+        self.journal.note("rollout", **record)
+        self._judge(trial, record)
+
+    def _judge(self, trial: PlannedTrial, record: Mapping[str, Any]) -> None:
+        """Asks how a trial ended, and writes it."""
+        if record["ended"] == "trouble":
+            row = self._row(trial, record, Outcome.SIM_ERROR, record["problem"], "invalid")
+            self.journal.finish(trial.order, row)
+            self.say(f"trial {trial.order + 1}: {record['problem']}")
+            return
+        early = record["button"] if record["button"] in ("success", "failure") else ""
+        said = Answer(early) if early else self._verdict(trial)
+        note = said.values.get("note", "")[:2000]
+        if said.button == "invalid":
+            reason = said.values.get("reason", "other")
+            text = f"invalid ({reason if reason in REASONS else 'other'}){': ' + note if note else ''}"
+            row = self._row(trial, record, Outcome.SIM_ERROR, text, "invalid", note)
+        else:
+            outcome = Outcome.SUCCESS if said.button == "success" else Outcome.HORIZON
+            row = self._row(trial, record, outcome, "", said.button, note)
+        self.journal.finish(trial.order, row)
+        self.say(f"trial {trial.order + 1}: {said.button}")
+
+    def _verdict(self, trial: PlannedTrial) -> Answer:
+        return self.console.ask(
+            "verdict",
+            "Is the task done, as the instruction says?",
+            ("success", "failure", "invalid"),
+            {
+                "instruction": self._by_id[trial.point].scenario.task.instruction,
+                "code": trial.code,
+                "reasons": list(REASONS),
+            },
+        )
+
+    def _row(
+        self,
+        trial: PlannedTrial,
+        record: Mapping[str, Any],
+        outcome: Outcome,
+        reason: str,
+        verdict: Any,
+        note: str = "",
+    ) -> TrialRow:
+        point, planned = self._by_id[trial.point], self.plan.plan.policies[trial.policy]
+        start = record.get("start_error")
+        robot = RobotTrial(
+            robot_type=point.robot_type,
+            calibration_sha256=calibration_sha256(self.robot),
+            verdict=verdict,
+            rater=self.config.rater,
+            code=trial.code,
+            start_error=None if start is None else StartError.of_json(start),
+            reset_s=record.get("reset_s"),
+            attempts=record.get("attempts", 0),
+            duration_s=record.get("duration_s", 0.0),
+            block=trial.block,
+            order=trial.order,
+            episode=record.get("episode"),
+            note=note,
+            clock_jump_s=record.get("clock_jump_s", 0.0),
+        )
+        return make_row(
+            point.scenario,
+            self._protocol(trial.policy, planned),
+            dataset=str(self.points.root),
+            dataset_revision=None,
+            trial=trial.trial,
+            noise="unseeded",
+            batch_size=1,
+            outcome=outcome,
+            reason=reason,
+            steps=record.get("steps", 0),
+            handoff=None,
+            sim_s=record.get("reset_s") or 0.0,
+            policy_s=record.get("duration_s", 0.0),
+            actions_sha256=record.get("actions_sha256", ""),
+            interventions=record.get("interventions", ()),
+            extent=RunExtent(len(self._by_id), self.plan.plan.repeats),
+            robot=robot.as_json(),
+        )
+
+    def _protocol(self, name: str, planned: PlannedPolicy) -> EvalProtocol:
+        settings = {"overrides": list(planned.overrides), "rename_map": dict(planned.rename_map)}
+        inference = getattr(self.config.inference, "type", "sync")
+        return EvalProtocol(
+            start=Start.RECOVERY.value,
+            rewind_steps=0,
+            policy=self.plan.identities[name],
+            run_seed=self.plan.plan.seed,
+            execution_horizon=None,
+            policy_settings=settings,
+            options={"plan_sha256": self.plan.sha256, "policy_name": name, "inference": inference},
+            versions={"lerobot": version("lerobot")},
+        )
+
+    def _context(self, name: str) -> Any:
+        """A policy, loaded once; the robot stays connected."""
+        from lerobot_roborecover.robot.policies import load_context
+
+        if name not in self._contexts:
+            planned, first = self.plan.plan.policies[name], self.points.points[0]
+            self._contexts[name] = load_context(
+                self.robot,
+                planned.path,
+                fps=first.fps,
+                instruction=first.scenario.task.instruction,
+                overrides=planned.overrides,
+                rename_map=planned.rename_map,
+                inference=self.config.inference,
+            )
+        return self._contexts[name]
+
+    def _recorder_of(self, context: Any, fps: float) -> Recorder:
+        if self._recorder is None:
+            name = f"rollout_{self.config.folder.name}"
+            self._recorder = Recorder(
+                self.config.folder / name, name, self.robot, context.data.dataset_features, fps
+            )
+        return self._recorder
+
+
+__all__ = ["RobotRun", "RunConfig"]

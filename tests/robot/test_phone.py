@@ -1,0 +1,126 @@
+"""The console on a phone: let in by a code, one at a time, and what is pressed there reaches the run."""
+
+from __future__ import annotations
+
+import threading
+
+import httpx
+import numpy as np
+import pytest
+
+from lerobot_roborecover.robot.console import Console
+from lerobot_roborecover.robot.phone.server import Phone, PhoneConfig
+from lerobot_roborecover.scenario import ScenarioError
+from tests.support.browser import browsing
+
+
+@pytest.fixture
+def served():
+    console, lines = Console(), []
+    phone = Phone(console, PhoneConfig(port=0), lines.append)
+    yield console, phone, lines
+    phone.close()
+
+
+def client(phone: Phone) -> httpx.Client:
+    return httpx.Client(base_url=phone.address)
+
+
+def test_a_phone_needs_the_code_and_a_second_one_takes_over(served):
+    console, phone, lines = served
+    with client(phone) as first, client(phone) as second:
+        assert first.get("api/state").status_code == 403
+        assert first.post("api/enter", json={"code": "nonono"}).status_code == 403
+        code = phone.door.code
+        assert f"code for the phone: {code}" in lines
+        assert first.post("api/enter", json={"code": code}).json() == {"inside": True}
+        assert phone.door.code != code, "a code lets one phone in"
+        assert first.get("api/state").json()["name"] == "starting"
+        answer = second.post("api/enter", json={"code": phone.door.code})
+        assert answer.status_code == 409
+        assert "another phone is the console" in answer.json()["error"]
+        assert second.post("api/enter", json={"code": phone.door.code, "take_over": True}).status_code == 200
+        assert "another phone has taken over" in first.get("api/state").json()["error"]
+        first_code = phone.door.code
+        for _ in range(5):
+            first.post("api/enter", json={"code": "000000x"})
+        assert phone.door.code != first_code, "guesses use a code up"
+        page = second.get("")
+        assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
+        other = second.post("api/press", json={"button": "stop"}, headers={"Origin": "http://elsewhere"})
+        assert other.status_code == 403
+    assert not console.stopped
+
+
+def test_what_is_pressed_reaches_the_run_and_the_truth_of_the_lab_does_not_reach_the_phone(served):
+    console, phone, _ = served
+    said = []
+    asked = threading.Thread(
+        target=lambda: said.append(
+            console.ask("verdict", "Done?", ("success", "invalid"), {"truth": {"objects": 1}, "code": "A"})
+        )
+    )
+    asked.start()
+    with client(phone) as user:
+        user.post("api/enter", json={"code": phone.door.code})
+        while (state := user.get("api/state").json())["name"] != "verdict":
+            pass
+        assert state["details"] == {"code": "A"}
+        assert user.post("api/press", json={"button": "done"}).status_code == 409
+        user.post("api/press", json={"button": "invalid", "reason": "person", "note": "a hand"})
+        asked.join(10)
+        assert said[0].button == "invalid"
+        assert said[0].values == {"reason": "person", "note": "a hand"}
+        user.post("api/press", json={"button": "stop"})
+        assert console.stopped
+        assert user.post("api/leave", json={}).status_code == 200
+    assert not console.phone_gone
+
+
+def test_a_phone_that_does_not_ask_any_more_is_gone():
+    now = [0.0]
+    console = Console(seconds=lambda: now[0])
+    assert not console.phone_gone
+    console.heard()
+    now[0] = 7.0
+    assert not console.phone_gone
+    now[0] = 9.0
+    assert console.phone_gone
+
+
+def test_a_taken_port_is_one_line(served):
+    _, phone, _ = served
+    port = int(phone.address.split(":")[2].split("/")[0])
+    with pytest.raises(ScenarioError, match="Name another port, or 0 for a free one"):
+        Phone(Console(), PhoneConfig(port=port))
+
+
+@pytest.mark.browser
+def test_the_ghost_and_the_buttons_in_a_browser(served):
+    console, phone, _ = served
+    picture = np.full((48, 48, 3), 90, np.uint8)
+    console.pictures = {"top": (picture, picture)}
+    error = {"joints": {}, "problems": ["camera top: objects are 4.2 px off, at most 2"]}
+    error["cameras"] = {"top": {"background_px": 0.1, "object_px": 4.2, "similarity": 0.9, "tag_mm": None}}
+    said = []
+    details = {"instruction": "push the puck", "start_error": error}
+    asked = threading.Thread(
+        target=lambda: said.append(console.ask("place", "Put it back.", ("done", "skip"), details))
+    )
+    asked.start()
+    with browsing() as visit:
+        page, complaints = visit(phone.address)
+        page.fill("#code", phone.door.code)
+        page.click("#enter")
+        page.wait_for_selector("#cameras img")
+        page.wait_for_selector("text=top: camera 0.1 px, objects 4.2 px")
+        assert page.inner_text("#problems") == error["problems"][0]
+        page.click("text=edges")
+        page.click("#buttons [data-name=done]")
+        asked.join(20)
+        page.click("#stop")
+        page.wait_for_selector("text=STOPPED")
+        # Before the code was typed the page asked whether it is inside, and was not.
+        assert [c for c in complaints if "403" not in c] == []
+    assert said[0].button == "done"
+    assert console.stopped

@@ -1,0 +1,115 @@
+"""A policy on the simulated lab: recorded, watched, ended in time; and whatever breaks leaves its episode."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.console import Answer, Console
+from lerobot_roborecover.robot.recorder import Recorder, marks, read_notes, truths
+from tests.support.robot_lab import lab, scripted
+
+pytestmark = pytest.mark.lerobot
+
+
+class Presses:
+    """Presses buttons at given polls."""
+
+    def __init__(self, **at):
+        self.at, self.count = {v: k for k, v in at.items()}, -1
+
+    def answer(self, screen, details):
+        self.count += 1
+        return Answer(self.at[self.count]) if self.count in self.at else None
+
+
+class Still:
+    """A teleoperator that holds its robot where it is told to."""
+
+    def get_action(self):
+        return {"x.pos": 123.0, "y.pos": -50.0}
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    return scripted(tmp_path_factory.mktemp("policies") / "good", size=48)
+
+
+def roll(robot, policy, folder, presses=None, limit_s=3.0, teleop=None):
+    from lerobot_roborecover.robot.policies import load_context
+    from lerobot_roborecover.robot.rollout import RecordedRollout
+
+    context = load_context(robot, policy, fps=20, instruction=robot.instruction)
+    recorder = Recorder(folder, "rollout_test", robot, context.data.dataset_features, 20)
+    strategy = RecordedRollout(recorder, Console(presses), limit_s, robot.instruction, teleop)
+    strategy.setup(context)
+    strategy.run(context)
+    strategy.teardown(context)
+    return strategy.end
+
+
+def test_episodes_are_whole_after_each_rollout_and_the_robot_stays_connected(tmp_path, policy):
+    from lerobot.datasets import LeRobotDataset
+
+    with lab(tmp_path) as robot:
+        first = roll(
+            robot, policy, tmp_path / "d", Presses(mark=10, takeover=20, handback=30, end=40), 9.0, Still()
+        )
+        assert (first.steps, first.ended, first.button, first.episode) == (40, "button", "end", 0)
+        assert first.marks == [10]
+        assert first.interventions == [{"kind": "takeover", "step": 20, "by": "person", "steps": 10}]
+        assert len(LeRobotDataset("local/rollout_test", root=tmp_path / "d")) == 40
+        second = roll(robot, policy, tmp_path / "d", limit_s=1.0)
+        assert (second.steps, second.ended, second.episode) == (20, "time", 1)
+        assert robot.is_connected
+    found = LeRobotDataset("local/rollout_test", root=tmp_path / "d")
+    assert (found.num_episodes, len(found)) == (2, 60)
+    taken = [bool(found[i]["intervention"]) for i in range(40)]
+    assert taken == [20 <= i < 30 for i in range(40)]
+    np.testing.assert_allclose(found[25]["action"], [123.0, -50.0])
+    assert read_notes(tmp_path / "d").robot_type == "roborecover_lab"
+    assert marks(tmp_path / "d") == [{"episode": 0, "frame": 10, "by": "operator"}]
+    assert len(truths(tmp_path / "d", 1)) == 20
+
+
+def test_the_scripted_policy_solves_the_task_and_a_biased_one_is_worse(tmp_path, policy):
+    worse = scripted(tmp_path / "policy", size=48, bias_mm=60.0)
+    solved = {"good": 0, "worse": 0}
+    with lab(tmp_path) as robot:
+        for seed in range(3):
+            for name, path in (("good", policy), ("worse", worse)):
+                robot.new_scene(seed)
+                roll(robot, path, tmp_path / name, limit_s=6.0)
+                solved[name] += robot.world.succeeded()
+    assert solved["good"] >= 2
+    assert solved["good"] > solved["worse"]
+
+
+def test_trouble_ends_a_rollout_in_one_line_and_keeps_what_was_recorded(tmp_path, policy):
+    with lab(tmp_path, unplug_at_step=15) as robot:
+        lost = roll(robot, policy, tmp_path / "lost")
+    assert (lost.ended, lost.steps, lost.episode) == ("trouble", 15, 0)
+    assert "does not answer" in lost.problem
+    assert "\n" not in lost.problem
+    assert json.loads((tmp_path / "lost/meta/info.json").read_text())["total_frames"] == 15
+    with lab(tmp_path, freeze_at_step=5) as robot:
+        frozen = roll(robot, policy, tmp_path / "frozen")
+    assert frozen.ended == "trouble"
+    assert "camera 'top' has given the same picture for 1.0 s" in frozen.problem
+    assert 24 <= frozen.steps <= 27
+
+
+def test_a_policy_whose_camera_is_not_there_is_refused_before_anything_moves(tmp_path, policy):
+    from lerobot_roborecover.robot.policies import load_context
+
+    with lab(tmp_path) as robot:
+        robot.observation_features = {n: f for n, f in robot.observation_features.items() if n != "top"}
+        with pytest.raises(
+            OptionError, match=r"needs observation.images.top; the robot has observation.images.wrist"
+        ):
+            load_context(robot, policy, fps=20, instruction="push")
+        with pytest.raises(OptionError, match="cannot be loaded"):
+            load_context(robot, str(tmp_path / "nothing"), fps=20, instruction="push")

@@ -1,0 +1,243 @@
+"""From a policy's rollout to a compared pair: captured, restored, run blind, judged, logged, reported."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.logs.robot import RobotTrial
+from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.robot.connection import RobotError
+from lerobot_roborecover.robot.console import Answer, Console
+from lerobot_roborecover.robot.plan import lock_plan, parse_plan
+from lerobot_roborecover.robot.recorder import marks
+from lerobot_roborecover.robot.run_journal import RunJournal
+from lerobot_roborecover.scenario import ScenarioError
+from tests.support.robot_lab import lab, scripted
+
+pytestmark = pytest.mark.lerobot
+FPS = 20
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Policies, and two recovery points of episodes that were captured on the lab."""
+    from lerobot_roborecover.robot.capture import capture
+    from lerobot_roborecover.robot.episodes import Episodes, PointRequest
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+    from lerobot_roborecover.robot.points import write_points
+    from lerobot_roborecover.robot.policies import load_context
+
+    root = tmp_path_factory.mktemp("robot")
+    scripted(root / "good", size=48)
+    scripted(root / "worse", size=48, bias_mm=60.0)
+    with lab(root) as robot:
+        context = load_context(robot, str(root / "worse"), fps=FPS, instruction=robot.instruction)
+        found = capture(
+            robot, context, root / "cube", Console(SimulatedOperator(robot)), episodes=2, limit_s=5.0,
+            instruction=robot.instruction, say=lambda line: None,
+        )  # fmt: skip
+    assert found == 2
+    episodes = Episodes(root / "cube")
+    both = [
+        episodes.point(
+            PointRequest(m["episode"], m["frame"], "Approach", "Wrong Pose", quasi_static=True), 6.0
+        )
+        for m in marks(root / "cube")
+    ]
+    write_points(root / "points", [s for s, _ in both], {s.id: p for s, p in both})
+    return root
+
+
+def plan_of(made, **changes):
+    values = {
+        "points": str(made / "points"),
+        "policies": {"good": {"path": str(made / "good")}, "worse": {"path": str(made / "worse")}},
+        "repeats": 1,
+        "seed": 3,
+        "tolerance": {"joint": 4.0, "object_px": 1.5, "background_px": 1.5},
+        "motion": {"speed": 300.0, "tolerance": 2.0, "max_lag": 250.0, "max_detour": 50.0},
+    }
+    return parse_plan({**values, **changes})
+
+
+def go(made, folder, robot, operator, **changes):
+    from lerobot_roborecover.robot.run import RobotRun, RunConfig
+
+    stop_after = changes.pop("stop_after", 0)
+    locked, points = lock_plan(plan_of(made, **changes), folder)
+    lines: list[str] = []
+    journal = RunJournal(folder)
+    try:
+        config = RunConfig(folder, "kim", stop_after=stop_after)
+        RobotRun(robot, locked, points, journal, Console(operator), config, say=lines.append).run()
+    finally:
+        journal.close()
+    return read_trial_log(folder / "trials.jsonl"), lines
+
+
+class Spoken:
+    """The simulated operator, with something else to say on some screens."""
+
+    def __init__(self, operator, **said):
+        self.operator, self.said = operator, said
+
+    def answer(self, screen, details):
+        if self.said.get(screen):
+            return self.said[screen].pop(0)
+        return self.operator.answer(screen, details)
+
+
+def test_a_plan_is_run_blind_and_resumed_and_its_log_is_a_study(made, tmp_path):
+    from lerobot_roborecover.analysis.analyse import analyse
+    from lerobot_roborecover.analysis.logs import read_study
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    with lab(made) as robot:
+        operator = SimulatedOperator(robot, sd_mm=3.0, max_tries=8)
+        first, _ = go(made, tmp_path, robot, operator, stop_after=1)
+        assert len(first) == 1
+        rows, lines = go(made, tmp_path, robot, operator)
+    assert len(rows) == 4
+    assert rows[0] == first[0]
+    assert {r.platform for r in rows} == {"robot"}
+    codes = {RobotTrial.of_json(r.robot).code for r in rows}
+    assert codes == {"A", "B"}
+    assert not any("good" in line or "worse" in line for line in lines)
+    for row in rows:
+        trial = RobotTrial.of_json(row.robot)
+        assert trial.rater == "kim"
+        assert trial.reset_s > 0
+        assert abs(trial.start_error.worst("joint")) <= 4.0
+        if row.outcome in ("success", "horizon"):
+            assert not trial.start_error.problems
+            assert trial.episode is not None
+    good = [r.success for r in rows if r.options["policy_name"] == "good"]
+    worse = [r.success for r in rows if r.options["policy_name"] == "worse"]
+    assert sum(good) > sum(worse)
+    results = analyse(read_study([str(tmp_path / "trials.jsonl")]))
+    assert len(results.recovery.arms) == 2
+
+
+def test_a_changed_plan_and_a_second_console_are_refused(made, tmp_path):
+    lock_plan(plan_of(made), tmp_path)
+    with pytest.raises(OptionError, match="the plan was locked when the run began; its plan changed"):
+        lock_plan(plan_of(made, repeats=2), tmp_path)
+    journal = RunJournal(tmp_path)
+    with pytest.raises(ScenarioError, match="in use by another process; stop that one first"):
+        RunJournal(tmp_path)
+    journal.close()
+
+
+def test_the_order_is_random_within_blocks_and_the_same_each_time(made, tmp_path):
+    locked, _ = lock_plan(plan_of(made, repeats=5), tmp_path)
+    again, _ = lock_plan(plan_of(made, repeats=5), tmp_path)
+    assert locked.trials == again.trials
+    for block in range(5):
+        inside = [(t.point, t.policy) for t in locked.trials if t.block == block]
+        assert len(set(inside)) == 4
+    orders = {tuple(t.policy for t in locked.trials if t.block == b) for b in range(5)}
+    assert len(orders) > 1
+
+
+def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    with lab(made) as robot:
+        operator = SimulatedOperator(robot, sd_mm=0.0)
+        said = {
+            "running": [Answer("end")],
+            "verdict": [Answer("failure"), Answer("invalid", {"reason": "person", "note": "a hand came in"})],
+            "next": [Answer("go"), Answer("undo"), Answer("pause")],
+        }
+        rows, _ = go(made, tmp_path, robot, Spoken(operator, **said))
+    (row,) = rows
+    assert (row.outcome, row.reason) == ("sim_error", "invalid (person): a hand came in")
+    # A crash between the journal and the log: the log is put right.
+    (tmp_path / "trials.jsonl").write_text("")
+    RunJournal(tmp_path).close()
+    assert read_trial_log(tmp_path / "trials.jsonl") == rows
+
+
+def test_after_a_crash_before_the_verdict_only_the_verdict_is_asked(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    class Crashed(Exception):
+        pass
+
+    class Crashes(Spoken):
+        def answer(self, screen, details):
+            if screen == "verdict":
+                raise Crashed
+            return super().answer(screen, details)
+
+    with lab(made) as robot:
+        operator = SimulatedOperator(robot, sd_mm=0.0)
+        with pytest.raises(Crashed):
+            go(made, tmp_path, robot, Crashes(operator, running=[Answer("end")]))
+        said = {"verdict": [Answer("success")], "next": [Answer("pause")]}
+        rows, lines = go(made, tmp_path, robot, Spoken(operator, **said))
+    assert [r.outcome for r in rows] == ["success"]
+    assert "has no verdict yet" in lines[0]
+
+
+def test_a_start_outside_the_tolerance_is_not_run(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    with lab(made) as robot:
+        careless = SimulatedOperator(robot, sd_mm=0.0, bias_mm=(60.0, 0.0), max_tries=2)
+        rows, lines = go(made, tmp_path, robot, careless, stop_after=1)
+        robot.world.bump("top", (6.0, 0.0))
+        careful = SimulatedOperator(robot, sd_mm=0.0, max_tries=1)
+        bumped, _ = go(made, tmp_path / "bumped", robot, careful, stop_after=1)
+    assert rows[0].outcome == "state_mismatch"
+    assert "objects are" in rows[0].reason
+    assert "not run" in lines[0]
+    assert RobotTrial.of_json(rows[0].robot).attempts >= 2
+    assert "the camera has moved by" in bumped[0].reason
+
+
+def test_a_robot_unplugged_in_mid_trial_leaves_a_row_and_the_run_goes_on_later(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    with lab(made, unplug_at_step=400) as robot:
+        operator = SimulatedOperator(robot, sd_mm=0.0)
+        with pytest.raises(RobotError, match="does not answer"):
+            go(made, tmp_path, robot, Spoken(operator, running=[]), repeats=20)
+    before = read_trial_log(tmp_path / "trials.jsonl") if (tmp_path / "trials.jsonl").is_file() else []
+    with lab(made) as robot:
+        rows, _ = go(made, tmp_path, robot, SimulatedOperator(robot, sd_mm=0.0), repeats=20, stop_after=1)
+    assert len(rows) == len(before) + 1
+
+
+def test_points_of_another_robot_calibration_or_reach_are_refused(made, tmp_path):
+    from dataclasses import replace
+
+    from lerobot_roborecover.robot.connection import check_point
+    from lerobot_roborecover.robot.points import read_points
+
+    point = read_points(made / "points").points[0]
+    with lab(made) as robot:
+        check_point(point, robot)
+        for change, words in (
+            ({"robot_type": "so101_follower"}, "is of robot 'so101_follower', this one is 'roborecover_lab'"),
+            ({"calibration_sha256": "ab" * 32}, "was recorded with calibration abababababab"),
+            ({"quasi_static": False}, "is not quasi-static"),
+            ({"pictures": {"side": "x"}}, "was seen by camera 'side'"),
+        ):
+            with pytest.raises(RobotError, match=words):
+                check_point(replace(point, **change), robot)
+        with pytest.raises(RobotError, match=r"outside its calibrated -1.0 to 1.0"):
+            check_point(point, robot, {"y.pos": (-1.0, 1.0)})
+
+
+def test_a_full_disk_stops_before_a_trial(made, tmp_path, monkeypatch):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2**30, 2**30, 0))
+    with lab(made) as robot, pytest.raises(RobotError, match="Make room, then start the same command again"):
+        go(made, tmp_path, robot, SimulatedOperator(robot))
+    assert json.loads((tmp_path / "plan.lock.json").read_text())["sha256"]
