@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from lerobot_roborecover.analysis.stats.power import Plan, PowerAssumptions, detectable
@@ -9,14 +10,29 @@ from lerobot_roborecover.analysis.tables import Column, Table
 
 
 def plan_table(
-    plans: Sequence[Plan], guess: PowerAssumptions, wanted: float, level: float, family: int
+    plans: Sequence[Plan],
+    guess: PowerAssumptions,
+    wanted: float,
+    level: float,
+    family: int,
+    robot_minutes: float | None = None,
 ) -> Table:
-    """What every difference takes, by trials a scenario."""
+    """What every difference takes, by trials a scenario.
+
+    Args:
+        plans: of each difference.
+        guess: what is believed.
+        wanted: chance.
+        level: confidence.
+        family: pairs.
+        robot_minutes: that a trial on a robot takes, its reset included; None leaves the hours out.
+    """
     rows = [
         (
             f"{100 * p.difference:g}", p.trials,
             "more than a million" if p.scenarios is None else str(p.scenarios),
             "" if p.scenarios is None else str(p.scenarios * p.trials), p.power, p.simulated,
+            *_hours(p, robot_minutes),
         )
         for p in plans
     ]  # fmt: skip
@@ -24,6 +40,7 @@ def plan_table(
         Column("Difference, points"), Column("Trials per scenario", "count"), Column("Scenarios"),
         Column("Trials of one policy"), Column("Power %", "percent"),
         Column("by simulation, %", "percent"),
+        *(() if robot_minutes is None else (Column("Hours at the robot, both policies", "number"),)),
     )  # fmt: skip
     return Table(
         "plan",
@@ -32,6 +49,12 @@ def plan_table(
         tuple(rows),
         (_believed(guess), _tested(level, family)),
     )
+
+
+def _hours(plan: Plan, minutes: float | None) -> tuple[float, ...]:
+    if minutes is None:
+        return ()
+    return (math.nan if plan.scenarios is None else 2 * plan.scenarios * plan.trials * minutes / 60,)
 
 
 def detectable_table(

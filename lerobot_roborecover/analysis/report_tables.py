@@ -11,6 +11,7 @@ from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions, ta
 from lerobot_roborecover.analysis.pair_tables import paired_contrasts, profiles, ranks
 from lerobot_roborecover.analysis.policy_tables import beside_published, outcomes, overall
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import robot_tables
 from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.stats.crossfit import oracle
 from lerobot_roborecover.analysis.stats.groups import Group, group_rates, source_matrix
@@ -39,7 +40,7 @@ _VERDICTS = {v: v.value for v in ComparisonVerdict} | {
 
 def all_tables(results: Results) -> list[Table]:
     """Every table that the study has something for, in the order of the report."""
-    tables = [overall(results), outcomes(results)]
+    tables = [overall(results), outcomes(results), *robot_tables(results)]
     if results.several_runs:
         tables += runs_tables(results)
     if len(results.recovery.arms) > 1:

@@ -44,6 +44,8 @@ class PlanOptions:
     """Confidence level."""
     family: int = option(1, metavar="PAIRS")
     """Pairs that p will be adjusted for: 15 for six policies."""
+    robot_minutes: float | None = option(None, metavar="MINUTES")
+    """Minutes of a trial on a robot, its reset included, to see the hours; scenarios are recovery points."""
     out: Path | None = option(None, metavar="DIR")
     """Folder for the tables (CSV, Markdown) and the figure."""
 
@@ -75,7 +77,9 @@ def run(options: PlanOptions) -> int:
     if at is not None:
         tables.append(detectable_table(guess, at, trials, *common))
     if at is None or given:
-        tables.append(plan_table(plans(guess, differences, trials, *common), guess, *common))
+        tables.append(
+            plan_table(plans(guess, differences, trials, *common), guess, *common, options.robot_minutes)
+        )
     for table in tables:
         print(f"{table.title}\n\n{to_text(table)}\n")
     for remark in remarks:
@@ -99,6 +103,8 @@ def _check(options: PlanOptions) -> None:
 
     if not 5 <= options.power < 100:
         raise RowsError(f"--power={options.power:g} is not a chance from 5 to below 100 per cent")
+    if options.robot_minutes is not None and not 0 < options.robot_minutes <= 1440:
+        raise RowsError(f"--robot-minutes={options.robot_minutes:g} is not from 0 to 1440 minutes")
     if not 0.5 <= options.level < 1:
         raise RowsError(f"--level={options.level:g} is not a confidence level from 0.5 to below 1")
     if not 1 <= options.family <= 1_000_000:

@@ -280,7 +280,12 @@ class RobotRun:
         )
 
     def _protocol(self, name: str, planned: PlannedPolicy) -> EvalProtocol:
-        settings = {"overrides": list(planned.overrides), "rename_map": dict(planned.rename_map)}
+        settings: dict[str, Any] = {
+            "overrides": list(planned.overrides),
+            "rename_map": dict(planned.rename_map),
+        }
+        if list(self.plan.identities.values()).count(self.plan.identities[name]) > 1:
+            settings["name"] = name  # an A/A comparison: one policy under two names
         inference = getattr(self.config.inference, "type", "sync")
         return EvalProtocol(
             start=Start.RECOVERY.value,

@@ -30,6 +30,7 @@ REPORT_FILES = ("report.html", "report.md", "results.json", "figures", "tables")
 
 _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("overall", "forest", ("overall",)),
+    ("starts", "", ("robot_starts", "robot_slopes")),
     ("runs", "runs", ("methods", "runs", "method_contrasts")),
     ("ranks", "rank_transition", ("ranks", "inversions")),
     ("differences", "paired_differences", ("contrasts", "profiles")),
@@ -45,6 +46,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 """Sections of the page: anchor, figure, tables. One without content is left out."""
 _HEADINGS = {
     "overall": "Recovery success",
+    "starts": "How far off the starts were",
     "runs": "Methods and their runs",
     "ranks": "Initial states against recovery",
     "differences": "Which policies differ",
