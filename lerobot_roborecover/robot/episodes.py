@@ -142,8 +142,8 @@ class Episodes:
         truth = dict(truths(self.root, episode)[frame]) if truths(self.root, episode) else {}
         boxes = request.boxes if request.boxes is not None else truth.pop("boxes", {})
         scenario = make_point(
-            id=f"{_plain(self.root.name)}-e{episode:04d}-f{frame:05d}",
-            task_name=_plain(instruction)[:80],
+            id=f"{plain_name(self.root.name)}-e{episode:04d}-f{frame:05d}",
+            task_name=plain_name(instruction)[:80],
             instruction=instruction,
             actions=self.columns(episode, "action")[:frame],
             labels={
@@ -151,7 +151,7 @@ class Episodes:
                 "deviation": request.deviation,
                 "source": request.source,
                 "source_policy": request.source_policy,
-                "cluster": f"{_plain(self.root.name)}-e{episode:04d}",
+                "cluster": f"{plain_name(self.root.name)}-e{episode:04d}",
             },
             robot_type=self.notes.robot_type,
             calibration_sha256=self.notes.calibration_sha256,
@@ -171,5 +171,6 @@ class Episodes:
         return scenario, pictures
 
 
-def _plain(text: str) -> str:
+def plain_name(text: str) -> str:
+    """A text as part of an id."""
     return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-") or "point"

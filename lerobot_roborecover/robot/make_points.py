@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.annotate import annotate, voted
 from lerobot_roborecover.robot.episodes import Episodes, PointRequest
 from lerobot_roborecover.robot.options import RobotPointsOptions
 from lerobot_roborecover.robot.points import write_points
@@ -24,7 +25,10 @@ def make_points(options: RobotPointsOptions, say: Callable[[str], None]) -> int:
         OptionError: a moment cannot be read, or it is not said to be quasi-static.
         ScenarioError: the dataset cannot be used, or has no marks.
     """
-    if not options.quasi_static:
+    if options.annotators:
+        annotate(options, say)
+        return 0
+    if options.votes_needed is None and not options.quasi_static:
         raise OptionError(
             "--quasi-static: look at each moment first. Only where nothing is falling, sliding or held by "
             "friction alone can a hand put the scene back; then say so with this option"
@@ -33,10 +37,13 @@ def make_points(options: RobotPointsOptions, say: Callable[[str], None]) -> int:
     if options.calibration is not None:
         sha256 = _calibration_sha256(options.calibration)
         episodes.notes = replace(episodes.notes, calibration_sha256=sha256)
-    requests = [_parse(text, options) for text in options.at] or [
-        _request(m["episode"], m["frame"], options.stage, options.deviation, options)
-        for m in marks(options.dataset)
-    ]
+    if options.votes_needed is not None:
+        requests = voted(options, say)
+    else:
+        requests = [_parse(text, options) for text in options.at] or [
+            _request(m["episode"], m["frame"], options.stage, options.deviation, options)
+            for m in marks(options.dataset)
+        ]
     if not requests:
         raise ScenarioError(
             f"{options.dataset} has no marks. Name moments with --at EPISODE:FRAME, or capture with "

@@ -28,5 +28,11 @@ class RobotPointsOptions:
     """Of a trial."""
     source_policy: str = ""
     """Who drove the robot in the episodes."""
+    annotators: tuple[str, ...] = option((), name="annotator", metavar="NAME")
+    """Serves the annotation page, where each annotator marks alone and blind; may be given again."""
+    votes_needed: int | None = option(None, metavar="N")
+    """Makes the points from so many annotators' votes: majority of stage and type, median frame."""
+    port: int = 8731
+    """Of the annotation page; 0 takes a free one."""
     calibration: Path | None = option(None, metavar="FILE")
     """LeRobot's calibration file of the robot, for a dataset that this package did not record."""

@@ -31,7 +31,7 @@ from lerobot_roborecover.curation.validate.validation import (
     replays_from,
 )
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
-from lerobot_roborecover.datasets.frames import LastFrames, _encode, last_frames
+from lerobot_roborecover.datasets.frames import LastFrames, encode_png, last_frames
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
@@ -232,7 +232,7 @@ def validated(tmp_path_factory):
     picture = frames[7].arrays()["observation.image"][2].copy()
     picture[4:12, 4:12] = 0
     png = frames[7].png["observation.image"]
-    altered = {"observation.image": (*png[:2], _encode(picture), *png[3:])}
+    altered = {"observation.image": (*png[:2], encode_png(picture), *png[3:])}
     frames[7] = LastFrames(frames[7].scenario_id, frames[7].sha256, frames[7].step, altered)
     write_scenarios(root / "set", scenarios, license="MIT", frames=frames)
     record_decisions(root / "set", [Decision(s.id, "screen", "kept") for s in scenarios])

@@ -30,6 +30,7 @@ DISCARD_REASONS: dict[str, str] = {
     "erratic": "Erratic motion, or out of the workspace",
     "irreversible": "Task damaged for good, e.g. an object fell off the table",
     "stuck": "The robot can no longer interact properly",
+    "not_still": "On a real robot: never at rest, so that a hand could put it back",
     "unclear": "Cannot be told from the video",
     "other": "Something else: say it in the comment",
 }
