@@ -78,7 +78,7 @@ def capture(
                 f"episode {end.episode}: {pluralize(end.steps, 'frame')}, "
                 f"{pluralize(len(end.marks), 'mark')}" + (f" at {end.marks}" if end.marks else "")
             )
-        if end.ended == "trouble":
+        if end.ended in ("trouble", "policy"):
             raise RobotLostError(f"{end.problem}. Episodes up to here are in {folder}")
         if end.ended == "stop":
             console.ask("stopped", "The robot was stopped. Look at it, then press Go.", ("go",))

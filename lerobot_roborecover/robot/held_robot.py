@@ -7,6 +7,7 @@ from typing import Any
 from lerobot.robots import Robot
 
 from lerobot_roborecover.robot.config_held_robot import HeldRobotConfig
+from lerobot_roborecover.robot.connection import asking
 
 
 class HeldRobot(Robot):
@@ -51,12 +52,14 @@ class HeldRobot(Robot):
         """Nothing: that is done when it is connected."""
 
     def get_observation(self) -> dict[str, Any]:
-        """The robot's own."""
-        return self.held.get_observation()
+        """The robot's own; a robot that does not answer is a `RobotLostError`."""
+        with asking(self.held):
+            return self.held.get_observation()
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """The robot's own."""
-        return self.held.send_action(action)
+        """The robot's own; a robot that does not answer is a `RobotLostError`."""
+        with asking(self.held):
+            return self.held.send_action(action)
 
     def disconnect(self) -> None:
         """Nothing: the run that holds the robot does it."""

@@ -74,6 +74,37 @@ def load_context(
         raise OptionError(f"policy {path} cannot be loaded: {' '.join(str(err).split())[:300]}") from err
 
 
+def warm_up(context: Any) -> None:
+    """Has a policy infer once and throws the action away, so that a trial does not pay for a slow first time.
+
+    An engine in the background (RTC) warms up by itself.
+
+    Args:
+        context: of the policy; its robot is looked at, and does not move.
+
+    Raises:
+        OptionError: the policy cannot infer on what the robot observes.
+        RobotLostError: the robot does not answer.
+    """
+    from lerobot.rollout.inference import SyncInferenceEngine
+    from lerobot.utils.constants import OBS_STR
+    from lerobot.utils.feature_utils import build_dataset_frame
+
+    engine = context.policy.inference
+    if isinstance(engine, SyncInferenceEngine):
+        observation = context.hardware.robot_wrapper.get_observation()
+        seen = context.processors.robot_observation_processor(observation)
+        engine.reset()
+        try:
+            engine.get_action(build_dataset_frame(context.data.dataset_features, seen, prefix=OBS_STR))
+        except (RuntimeError, ValueError, KeyError, TypeError) as err:
+            raise OptionError(
+                "a policy cannot infer on what the robot observes: "
+                f"{type(err).__name__}: {' '.join(str(err).split())[:300]}"
+            ) from err
+        engine.reset()
+
+
 def set_instruction(context: Any, instruction: str) -> None:
     """Gives a policy's engine another instruction; LeRobot's own is fixed where the engine is made."""
     assert hasattr(context.policy.inference, "_task")

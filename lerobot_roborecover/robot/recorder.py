@@ -124,10 +124,12 @@ class Recorder:
         return int(json.loads(path.read_text("utf-8"))["total_episodes"]) if path.is_file() else 0
 
     def begin(self) -> None:
-        """Begins an episode."""
+        """Begins an episode; files are opened with its first frame, so that an empty one leaves none."""
+        self._frames, self._truth = 0, []
+
+    def _open(self) -> None:
         from lerobot.datasets import LeRobotDataset
 
-        self._frames, self._truth = 0, []
         repo_id = f"local/{self._name}"
         if (self.root / "meta" / "info.json").is_file():
             self._dataset = LeRobotDataset.resume(repo_id, root=self.root, streaming_encoding=True)
@@ -148,6 +150,8 @@ class Recorder:
 
     def add(self, frame: Mapping[str, Any], task: str, intervention: bool) -> None:
         """Adds a frame: observation and the action that followed it."""
+        if self._dataset is None:
+            self._open()
         self._dataset.add_frame({**frame, INTERVENTION: np.array([intervention]), "task": task})
         if hasattr(self._robot, "hidden_truth"):
             self._truth.append(self._robot.hidden_truth())
@@ -162,12 +166,9 @@ class Recorder:
         if self._dataset is None:
             return None
         number = self.number
-        if self._frames:
-            self._dataset.save_episode()
+        self._dataset.save_episode()
         self._dataset.finalize()
         self._dataset = None
-        if not self._frames:
-            return None
         if self._truth:
             append_records(self.root / FOLDER / TRUTH_FILE, {"episode": number, "frames": self._truth})
         return number

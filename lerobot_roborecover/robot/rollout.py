@@ -30,11 +30,11 @@ class RolloutEnd:
     """Actions that were sent, a person's included."""
     duration_s: float = 0.0
     ended: str = "time"
-    """`time`, `button` (a person ended it), `stop` (emergency), or `trouble`."""
+    """`time`, `button` (a person ended it), `stop` (emergency), `policy` (it raised), or `trouble`."""
     button: str = ""
     """That ended it."""
     problem: str = ""
-    """Of `trouble`: one line."""
+    """Of `trouble` and `policy`: one line."""
     episode: int | None = None
     interventions: list[dict[str, Any]] = field(default_factory=list)
     actions_sha256: str = ""
@@ -78,6 +78,9 @@ class RecordedRollout(RolloutStrategy):
             self._loop(ctx, digest)
         except RobotLostError as err:
             self.end.ended, self.end.problem = "trouble", str(err)
+        except Exception as err:  # a policy may raise anything; its trial becomes a row with the reason
+            words = " ".join(str(err).split())[:300]
+            self.end.ended, self.end.problem = "policy", f"the policy failed: {type(err).__name__}: {words}"
         finally:
             self.end.actions_sha256 = digest.hexdigest() if self.end.steps else ""
             self.end.episode = self._recorder.save()
@@ -105,20 +108,18 @@ class RecordedRollout(RolloutStrategy):
             driving, over = self._heard(driving)
             if over:
                 return
-            with asking(robot):
-                observation = robot.get_observation()
+            observation = robot.get_observation()
             if problem := self._frozen(robot, observation, tick):
                 self.end.ended, self.end.problem = "trouble", problem
                 return
             processed = self._process_observation_and_notify(ctx.processors, observation)
             if self._handle_warmup(ctx.runtime.cfg.use_torch_compile, tick, interval):
                 continue
-            with asking(robot):
-                action = (
-                    self._person_acts(ctx, observation)
-                    if driving
-                    else send_next_action(processed, observation, ctx, self._interpolator)
-                )
+            action = (
+                self._person_acts(ctx, observation)
+                if driving
+                else send_next_action(processed, observation, ctx, self._interpolator)
+            )
             if action is not None:
                 frame = {
                     **build_dataset_frame(features, processed, prefix=OBS_STR),
@@ -166,7 +167,9 @@ class RecordedRollout(RolloutStrategy):
 
     def _person_acts(self, ctx: Any, observation: dict[str, Any]) -> dict[str, Any]:
         """Sends the teleoperator's action and returns it."""
-        action = ctx.processors.teleop_action_processor((self._teleop.get_action(), observation))
+        with asking(self._teleop):
+            given = self._teleop.get_action()
+        action = ctx.processors.teleop_action_processor((given, observation))
         ctx.hardware.robot_wrapper.send_action(ctx.processors.robot_action_processor((action, observation)))
         return action
 

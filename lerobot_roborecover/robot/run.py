@@ -87,10 +87,12 @@ class RobotRun:
             RobotError: a point is not this robot's, or the robot is lost; the run goes on where it stopped.
             ScenarioError: something cannot be written.
         """
+        from lerobot_roborecover.robot.policies import warm_up
+
         for point in self._by_id.values():
             check_point(point, self.robot, self.config.limits)
         for name in self.plan.plan.policies:
-            self._context(name)
+            warm_up(self._context(name))
         done = 0
         pending = self.journal.pending()
         if pending is not None:
@@ -202,8 +204,9 @@ class RobotRun:
 
     def _judge(self, trial: PlannedTrial, record: Mapping[str, Any]) -> None:
         """Asks how a trial ended, and writes it."""
-        if record["ended"] == "trouble":
-            row = self._row(trial, record, Outcome.SIM_ERROR, record["problem"], "invalid")
+        if record["ended"] in ("trouble", "policy"):
+            outcome = Outcome.POLICY_ERROR if record["ended"] == "policy" else Outcome.SIM_ERROR
+            row = self._row(trial, record, outcome, record["problem"], "invalid")
             self.journal.finish(trial.order, row)
             self.say(f"trial {trial.order + 1}: {record['problem']}")
             return

@@ -75,6 +75,8 @@ def test_episodes_are_whole_after_each_rollout_and_the_robot_stays_connected(tmp
     assert len(truths(tmp_path / "d", 1)) == 20
 
 
+@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_scripted_policy_solves_the_task_and_a_biased_one_is_worse(tmp_path, policy):
     worse = scripted(tmp_path / "policy", size=48, bias_mm=60.0)
     solved = {"good": 0, "worse": 0}
@@ -100,6 +102,28 @@ def test_trouble_ends_a_rollout_in_one_line_and_keeps_what_was_recorded(tmp_path
     assert frozen.ended == "trouble"
     assert "camera 'top' has given the same picture for 1.0 s" in frozen.problem
     assert 24 <= frozen.steps <= 27
+
+
+def test_a_policy_that_raises_is_not_taken_for_a_lost_robot(tmp_path, policy, monkeypatch):
+    from lerobot_roborecover.robot.lab.modeling_lab_pusher import LabPusherPolicy
+    from lerobot_roborecover.robot.policies import load_context, warm_up
+
+    def fails(self, batch):
+        raise RuntimeError("shapes do not match")
+
+    with lab(tmp_path) as robot:
+        context = load_context(robot, policy, fps=20, instruction="push")
+        warm_up(context)
+        monkeypatch.setattr(LabPusherPolicy, "select_action", fails)
+        with pytest.raises(
+            OptionError, match="cannot infer on what the robot observes: RuntimeError: shapes"
+        ):
+            warm_up(context)
+        end = roll(robot, policy, tmp_path / "raised")
+        monkeypatch.undo()
+        assert roll(robot, policy, tmp_path / "raised", limit_s=0.5).episode == 0
+    assert (end.ended, end.steps, end.episode) == ("policy", 0, None)
+    assert end.problem == "the policy failed: RuntimeError: shapes do not match"
 
 
 def test_a_policy_whose_camera_is_not_there_is_refused_before_anything_moves(tmp_path, policy):

@@ -203,7 +203,7 @@ def test_a_start_outside_the_tolerance_is_not_run(made, tmp_path):
 def test_a_robot_unplugged_in_mid_trial_leaves_a_row_and_the_run_goes_on_later(made, tmp_path):
     from lerobot_roborecover.robot.lab.operator import SimulatedOperator
 
-    with lab(made, unplug_at_step=400) as robot:
+    with lab(made, unplug_at_step=90) as robot:
         operator = SimulatedOperator(robot, sd_mm=0.0)
         with pytest.raises(RobotError, match="does not answer"):
             go(made, tmp_path, robot, Spoken(operator, running=[]), repeats=20)
