@@ -91,6 +91,8 @@ def _best_first(direct: Sequence[Arm], options: Options) -> list[Arm]:
 
 
 def _initial_remarks(direct: Sequence[Arm], initial: Sequence[Arm]) -> list[str]:
+    if not initial and all(row.robot is not None for arm in direct for row in arm.rows):
+        return []  # a robot has recovery points alone
     if not initial:
         return [
             "no trials from initial states: run lerobot-eval once more with --env.start=initial to see what "

@@ -58,6 +58,7 @@ def test_a_report_of_robots_shows_how_far_off_the_starts_were(tmp_path):
     refused = robot_row(0, 9, False, 8.0, policy="act@1", outcome="state_mismatch", reason="objects are off")
     log = write_log(tmp_path / "trials.jsonl", [*rows, refused])
     results = analyse(read_study([str(log)]))
+    assert not any("lerobot-eval" in remark for remark in results.remarks)
     starts, slope = robot_tables(results)
     act = next(row for row in starts.rows if row[0].startswith("act"))
     assert act[1:4:2] == (61, 1)

@@ -184,6 +184,27 @@ def test_after_a_crash_before_the_verdict_only_the_verdict_is_asked(made, tmp_pa
     assert "has no verdict yet" in lines[0]
 
 
+def test_a_clock_that_jumps_is_in_the_row_and_changes_no_duration(made, tmp_path, monkeypatch):
+    import time
+
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    real, jump = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() + jump[0])
+
+    class Jumps(Spoken):
+        def answer(self, screen, details):
+            jump[0] = 3600.0 if screen == "running" else jump[0]
+            return super().answer(screen, details)
+
+    with lab(made) as robot:
+        operator = SimulatedOperator(robot, sd_mm=0.0)
+        rows, _ = go(made, tmp_path, robot, Jumps(operator), stop_after=1)
+    trial = RobotTrial.of_json(rows[0].robot)
+    assert trial.clock_jump_s == pytest.approx(3600, abs=2)
+    assert trial.duration_s < 7
+
+
 def test_a_start_outside_the_tolerance_is_not_run(made, tmp_path):
     from lerobot_roborecover.robot.lab.operator import SimulatedOperator
 
