@@ -24,6 +24,7 @@ from lerobot_roborecover.datasets.pictures import grid_png, spread, stored_frame
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, package_versions
 from lerobot_roborecover.datasets.trajectories import TRAJECTORIES_FILE, TrajectorySet, read_trajectories
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import DeviationType, Scenario, ScenarioError, Stage
 
 MARK = "roborecover:card"
@@ -103,7 +104,9 @@ def _scenario_card(
         files[GRID] = grid_png(tiles)
     names = split_names(scenarios)
     files |= viewer_tables(scenarios, frame_of, names)
-    files[EVAL_FILE] = eval_yaml(common["title"], scenarios[0].platform, len(scenarios), names)
+    simulated = platform_named(scenarios[0].platform).simulated
+    if simulated:  # a robot's results are those of one lab
+        files[EVAL_FILE] = eval_yaml(common["title"], scenarios[0].platform, len(scenarios), names)
     episodes = (root / "meta" / "info.json").is_file()
     platform = scenarios[0].platform
     split = [s.split for s in scenarios]
@@ -112,6 +115,7 @@ def _scenario_card(
         metadata=_metadata(known, common["title"], platform, len(scenarios), _configs(names, episodes)),
         **common,
         platform=platform,
+        simulated=simulated,
         manifest={**manifest, "versions": package_versions(scenarios)},
         episodes=episodes,
         frames=any(name.startswith(f"{FRAMES_FOLDER}/") for name in manifest["files"]),

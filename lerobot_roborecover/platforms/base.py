@@ -107,6 +107,8 @@ class Platform(TaskCatalog):
     """Of the distribution that brings the platform's packages, e.g. `libero`; empty where none is needed."""
     distribution: ClassVar[str] = "lerobot_env_roborecover"
     """What installs the platform."""
+    simulated: ClassVar[bool] = True
+    """Whether it has a simulator; real robots have none."""
     simulator: ClassVar[str]
     """`module:Class` of the simulator, imported where one is made."""
     default_scenarios: ClassVar[str] = ""

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lerobot_roborecover.datasets.card import make_card
 from lerobot_roborecover.datasets.inspect import describe
 from lerobot_roborecover.datasets.schema import to_row
 from lerobot_roborecover.platforms import SimulatorError, platform_named, platform_names
@@ -77,3 +78,12 @@ def test_a_robot_is_a_platform_by_name_alone():
     with pytest.raises(SimulatorError, match="roborecover robot run"):
         platform_named("robot").make_simulator()
     assert "so101_follower" in describe(made_point("a"))
+
+
+def test_the_card_of_a_set_of_points_names_the_commands_of_robots(tmp_path):
+    root = write_points(tmp_path / "points", [made_point("a")], {"a": pictures_of(0)})
+    card = make_card(root, "me/points", license="mit", version="1.0.0", tag="v1.0.0")
+    text = card.files["README.md"].decode()
+    assert "roborecover robot restore --points=POINTS" in text
+    assert "lerobot-eval" not in text
+    assert "eval.yaml" not in card.files

@@ -21,6 +21,7 @@ class RobotPlatform(Platform):
     action_widths = tuple(range(1, _MAX_WIDTH + 1))
     control_hz = 30.0
     action_bound = float("inf")
+    simulated = False
     simulator = ""
 
     def tasks(self, options: Any = None) -> tuple[Task, ...]:
