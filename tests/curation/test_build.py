@@ -39,7 +39,7 @@ FAKE = {
         },
     },
     "screen": {"trials": 2, "keep": [0, 99], "slots": 1},
-    "validate": {"runs": 2, "workers": 2},
+    "validate": {"runs": 2, "num_workers": 2},
     "split": {"sizes": {"train": 0.5, "test": 0.5}},
     "render": {"frames": 64},
 }  # fmt: skip
@@ -285,7 +285,7 @@ def test_a_build_of_an_earlier_version_is_up_to_date(tmp_path):
             "policies": [{"path": "nowhere/act", "name": "act", "options": {"n_action_steps": 5}}],
             "trials": 2, "keep": [0.1, 0.9],
         },
-        "validate": {"runs": 2, "workers": 2}, "split": {"sizes": {"train": 0.5, "test": 0.5}, "seed": 7},
+        "validate": {"runs": 2, "num_workers": 2}, "split": {"sizes": {"train": 0.5, "test": 0.5}, "seed": 7},
         "render": {"frames": 64}, "publish": {"repo_id": "org/name"},
     }  # fmt: skip
     config = read_config(write(tmp_path / "build.yaml", content))

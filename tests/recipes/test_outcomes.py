@@ -58,7 +58,7 @@ def rate_of(success: dict[str, bool]) -> str:
 
 
 def test_the_page_on_intervention_timing_says_what_is_stored():
-    page = (DOCS / "stepping_in.md").read_text(encoding="utf-8")
+    page = (DOCS / "studies" / "intervention_timing.md").read_text(encoding="utf-8")
     logs = stored_logs(stored_folder("metaworld"))
     success = {name: {r.scenario_id: r.success for r in read_trial_log(logs[name])} for name in ARMS}
     direct = success[ARMS[0]]
@@ -75,7 +75,7 @@ def test_the_page_on_intervention_timing_says_what_is_stored():
 
 @pytest.mark.parametrize("name", ["detectors", pytest.param("detectors_recovery", marks=pytest.mark.nightly)])
 def test_the_page_on_detectors_says_what_is_stored(name):
-    page = (DOCS / "detectors.md").read_text(encoding="utf-8")
+    page = (DOCS / "log" / "detectors.md").read_text(encoding="utf-8")
     found = read_comparison(OUTCOMES / name)
     assert len(found.measured) == 9
     for detector in found.measured:
@@ -87,7 +87,7 @@ def test_the_page_on_detectors_says_what_is_stored(name):
 
 
 def test_the_page_on_training_on_recoveries_says_what_is_stored():
-    page = (DOCS / "recovery_data.md").read_text(encoding="utf-8")
+    page = (DOCS / "studies" / "recovery_data.md").read_text(encoding="utf-8")
     rates: dict[str, list[str]] = {}
     trials = 0
     for run, log in stored_logs(RECOVERY_DATA).items():

@@ -1,4 +1,4 @@
-"""Processors of the `remote` policy type: none of its own; the server has the policy's."""
+"""Processors of the policy type `roborecover_remote`: none of its own; the server has the policy's."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PR
 from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
 
 
-def make_remote_pre_post_processors(
+def make_roborecover_remote_pre_post_processors(
     config: RemoteConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
@@ -41,3 +41,7 @@ def make_remote_pre_post_processors(
             to_output=transition_to_policy_action,
         ),
     )
+
+
+make_remote_pre_post_processors = make_roborecover_remote_pre_post_processors
+"""LeRobot looks for the function by the policy type; `remote` is the type's earlier name."""
