@@ -23,6 +23,13 @@ def test_importing_the_package_is_light():
     assert not loaded & {*HEAVY, "pyarrow", "matplotlib", "scipy", "numpy", "gymnasium"}
 
 
+def test_public_names_are_listed():
+    import lerobot_roborecover
+
+    assert set(lerobot_roborecover.__all__) <= set(dir(lerobot_roborecover))
+    assert all(getattr(lerobot_roborecover, name) for name in ("load_scenarios", "TrialRow", "report"))
+
+
 def test_help_is_light():
     """It costs a tenth of a second, most of it Python's own."""
     code = (

@@ -20,6 +20,7 @@ from typing import Any
 import draccus
 import numpy as np
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
@@ -34,6 +35,12 @@ from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.policies.callables import (
+    CallableRunner,
+    callable_metadata,
+    is_callable_policy,
+    keeps_history,
+)
 from lerobot_roborecover.policies.identity import object_identity
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.metadata import policy_metadata
@@ -52,7 +59,7 @@ def evaluate(
     env: Mapping[str, Any] | Any = None,
     trials: int = 5,
     seed: int | None = 1000,
-    processors: tuple[Any, Any] | None = None,
+    processors: tuple[Any, Any] | str | Path | None = None,
     rename_map: Mapping[str, str] | None = None,
     device: str | None = None,
     name: str = "",
@@ -65,18 +72,24 @@ def evaluate(
 
     Args:
         policy: a checkpoint's folder or Hub id; a policy's configuration (`PreTrainedConfig`, which is how an
-            intervention or a remote policy is named); or a LeRobot policy object, e.g. the one in training.
-            Unwrap one that accelerate or DDP has wrapped.
+            intervention or a remote policy is named); a LeRobot policy object, e.g. the one in training
+            (unwrap one that accelerate or DDP has wrapped); or any callable that takes a raw observation and
+            the instruction, and returns an action (A,) or a chunk (n, A). A class, or a function without
+            arguments that returns a policy, gives each trial an instance. An object with `reset()` runs one
+            trial at a time, and is reset at each handoff.
         scenarios: a shipped set's name, a folder, a Hub id, or what `load_scenarios` gave, or some of it.
         env: options of the recovery env type by name, as after `--env.` (`{"start": "initial"}`), or its
             configuration.
         trials: per scenario.
         seed: of the run; trial k of a scenario draws from (seed, scenario, k) alone.
-        processors: pre- and postprocessor of a policy object; without, those saved with its checkpoint.
+        processors: pre- and postprocessor of a policy object, or the checkpoint that they are saved with.
+            Default: those of the checkpoint in `policy.config.pretrained_path`; a policy whose features are
+            not normalised needs none.
         rename_map: the environment's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
         device: of a policy that is loaded here; None takes what its configuration says.
-        name: of the policy in the rows, whose settings then hold its identity. Default: a checkpoint's
-            identity, or an object's type and a hash of its weights, configuration and processors.
+        name: of the policy in the rows, whose settings then hold its identity. Required for a callable.
+            Default: a checkpoint's identity, or an object's type and a hash of its weights, configuration and
+            processors.
         log: trial log to write to; trials that it holds already are not run again. None keeps none.
         slots: simulators at once; 0 takes what `roborecover eval` would.
         max_batch: observations per inference, at most.
@@ -96,16 +109,25 @@ def evaluate(
         raise OptionError(f"trials={trials}: must be 1 or more")
     chosen = _scenario_set(scenarios, env)
     options = _env_config(env, chosen.platform)
-    module: PreTrainedPolicy | None = policy if isinstance(policy, torch.nn.Module) else None
+    module: torch.nn.Module | None = policy if isinstance(policy, torch.nn.Module) else None
     with TemporaryFolder("evaluate") as folder, untouched(module):
         options.trial_log = str(log or folder / "trials.jsonl")
-        config = _policy_config(policy, device)
-        spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
-        own = () if module is None else _processors(spec, module, processors)
-        identity = "" if module is None else object_identity(module, own)
-        facts = policy_metadata(
-            config, policy=name, identity=identity, rename_map=rename_map, n_episodes=trials
-        )
+        if is_callable_policy(policy):
+            given = {"processors": processors, "rename_map": rename_map, "device": device}
+            slots = _check_callable(policy, given, slots)
+            facts = callable_metadata(policy, name, n_episodes=trials)
+            width = options.features["action"].shape[0]
+            make_host, device = partial(CallableRunner, policy, width, max_batch), "cpu"
+        else:
+            config = _policy_config(policy, device)
+            spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
+            own = () if module is None else _processors(spec, policy, processors)
+            facts = policy_metadata(
+                config, policy=name, identity=object_identity(module, own) if own else "",
+                rename_map=rename_map, n_episodes=trials,
+            )  # fmt: skip
+            make_host = partial(_host, spec, policy, *own) if own else partial(load_host, spec)
+            device = str(config.device)
         chosen, run = create_session(options, options.run_spec(), workers=True, facts=facts, scenarios=chosen)
         run.protocol = replace(run.protocol, run_seed=seed)
         run.pool.acquire()
@@ -121,10 +143,7 @@ def evaluate(
                     line.show(tally)
 
             if tally.done < tally.total:
-                places = EngineConfig(
-                    slots=slots, device=str(config.device), draws=options.obs_type != "state"
-                )
-                make_host = partial(load_host, spec) if module is None else partial(_host, spec, module, *own)
+                places = EngineConfig(slots=slots, device=device, draws=options.obs_type != "state")
                 engine = open_engine(run, units, make_host, places, on_row=show)
                 engine.run(units)
                 for (scenario, trial), reason in list(engine.unrun.items())[:1]:
@@ -199,7 +218,7 @@ def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
     if not isinstance(config, PreTrainedConfig):
         raise OptionError(
             f"policy={type(policy).__name__}: give a checkpoint's folder or Hub id, a LeRobot policy or its "
-            "configuration"
+            "configuration, or a callable (observation, instruction) -> action"
         )
     if policy is config:
         config = copy(config)  # loading fills in the environment's features
@@ -207,16 +226,37 @@ def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:
     return config
 
 
+def _check_callable(policy: Any, given: Mapping[str, Any], slots: int) -> int:
+    """Refuses arguments that a callable does not take; returns how many simulators run at once."""
+    for argument, value in given.items():
+        if value:
+            raise OptionError(f"{argument}: only for a LeRobot policy; a callable gets raw observations")
+    if not keeps_history(policy):
+        return slots
+    if slots > 1:
+        raise OptionError(
+            f"slots={slots}: an object with reset() keeps the history of one trial. Give its class, or a "
+            "function that makes one (each trial gets its own), or slots=1"
+        )
+    return 1
+
+
 def _processors(
-    spec: HostSpec, module: PreTrainedPolicy, processors: tuple[Any, Any] | None
+    spec: HostSpec, module: PreTrainedPolicy, processors: tuple[Any, Any] | str | Path | None
 ) -> tuple[Any, Any]:
     """A policy object's pre- and postprocessor."""
-    if processors is None and not spec.policy.pretrained_path:
+    if isinstance(processors, tuple):
+        return processors
+    source = processors or spec.policy.pretrained_path
+    modes = getattr(spec.policy, "normalization_mapping", {}).values()
+    normalises = any(mode is not NormalizationMode.IDENTITY for mode in modes)
+    if source is None and (normalises or spec.rename_map):
         raise OptionError(
-            "processors: a policy that was not loaded from a checkpoint needs its pre- and postprocessor, "
-            "which hold the training data's statistics: evaluate(policy, ..., processors=(pre, post))"
+            "processors: nothing says with which statistics this policy normalises, or where its rename map "
+            "goes. Give the checkpoint that has them, evaluate(policy, ..., processors=FOLDER_OR_HUB_ID), or "
+            "both processors: make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)"
         )
-    return processors or load_processors(module.config, spec)
+    return load_processors(module.config, spec, source)
 
 
 def _host(spec: HostSpec, module: PreTrainedPolicy, before: Any, after: Any) -> PolicyRunner:

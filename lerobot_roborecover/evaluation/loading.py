@@ -102,7 +102,7 @@ def _load_host(spec: HostSpec) -> PolicyRunner:
     policy.eval()
     if spec.cross_cpu_deterministic:
         make_cross_cpu_deterministic(policy)
-    preprocessor, postprocessor = load_processors(policy.config, spec)
+    preprocessor, postprocessor = load_processors(policy.config, spec, spec.policy.pretrained_path)
     env_pre, env_post = env_processors(spec.env, spec.policy)
     if isinstance(policy, ProvidesRunner):
         return policy.make_host(env_pre, env_post, preprocessor, spec.max_batch)
@@ -121,14 +121,14 @@ def _check_trained(config: PreTrainedConfig, policy: Any) -> None:
         )
 
 
-def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
-    """A policy's pre- and postprocessor, from where its checkpoint is.
+def load_processors(config: Any, spec: HostSpec, path: str | Path | None) -> tuple[Any, Any]:
+    """A policy's pre- and postprocessor.
 
     Args:
         config: of the loaded policy, which knows its device.
         spec: of the host.
+        path: of the checkpoint that has them; None makes new ones without statistics.
     """
-    path = spec.policy.pretrained_path
     overrides = {
         "device_processor": {"device": str(config.device)},
         "rename_observations_processor": {"rename_map": dict(spec.rename_map)},
@@ -136,6 +136,6 @@ def load_processors(config: Any, spec: HostSpec) -> tuple[Any, Any]:
     return make_pre_post_processors(
         policy_cfg=spec.policy,
         pretrained_path=None if path is None else str(path),
-        pretrained_revision=spec.policy.pretrained_revision,
+        pretrained_revision=spec.policy.pretrained_revision if path == spec.policy.pretrained_path else None,
         preprocessor_overrides=overrides,
     )

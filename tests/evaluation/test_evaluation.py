@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import operator
 import random
 import runpy
 from dataclasses import replace
@@ -46,7 +47,7 @@ def trained(act):
 
 
 def test_an_object_and_its_checkpoint_give_the_same_trials(dataset, act, trained, tmp_path):
-    policy, processors = trained
+    policy, _ = trained
     log = tmp_path / "trials.jsonl"
     saved = roborecover.evaluate(act, dataset, trials=2, log=log, **QUIET)
     assert [(r.scenario_id, r.trial) for r in saved] == [
@@ -55,7 +56,7 @@ def test_an_object_and_its_checkpoint_give_the_same_trials(dataset, act, trained
     assert saved[0].policy.startswith(f"{act.name}@")
     assert saved[0].execution_horizon == 2
     scenarios = list(roborecover.load_scenarios(str(dataset)))[1:]
-    given = roborecover.evaluate(policy, scenarios, trials=2, processors=processors, **QUIET)
+    given = roborecover.evaluate(policy, scenarios, trials=2, processors=act, **QUIET)
     assert given[0].policy.startswith("act@")
     assert outcomes(given) == {k: v for k, v in outcomes(saved).items() if k[0] != saved[0].scenario_id}
     again = roborecover.evaluate(act, dataset, trials=2, log=log, **QUIET)
@@ -136,9 +137,12 @@ def test_the_example_runs_without_an_account(capsys):
     assert "step 1: recovery/success" in capsys.readouterr().out
 
 
-def test_trackers_take_the_call():
-    wandb = pytest.importorskip("wandb", reason="the call's signature is compared with wandb's")
-    inspect.signature(wandb.sdk.wandb_run.Run.log).bind(None, {"recovery/success": 0.5}, step=10)
+@pytest.mark.parametrize(("tracker", "log"), [("wandb", "sdk.wandb_run.Run.log"), ("trackio", "log")])
+def test_trackers_take_the_call(tracker, log):
+    module = pytest.importorskip(tracker, reason=f"{tracker} is not installed: pip install {tracker}")
+    taken = inspect.signature(operator.attrgetter(log)(module))
+    metrics = {"recovery/success": 0.5}
+    taken.bind(*(() if "self" not in taken.parameters else (None,)), metrics, step=10)
 
 
 @pytest.mark.parametrize(
