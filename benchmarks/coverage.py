@@ -39,6 +39,7 @@ from coverage_settings import SIZES, Line
 
 PARTS = {
     "rates": settings.rates,
+    "retries": settings.retries,
     "tasks": settings.with_tasks,
     "macro": settings.macro,
     "differences": settings.differences,

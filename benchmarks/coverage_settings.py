@@ -18,6 +18,7 @@ from scipy import stats
 from lerobot_roborecover.analysis.stats.contrasts import holm
 from lerobot_roborecover.analysis.stats.crossfit import gain_over, oracle, profile_difference
 from lerobot_roborecover.analysis.stats.intervals import (
+    RARE,
     difference_interval,
     rate_interval,
     ratio_interval,
@@ -27,6 +28,7 @@ from lerobot_roborecover.analysis.stats.macro import LEAST_IN_CELL
 from lerobot_roborecover.analysis.stats.panel import Panel, ScenarioLabels
 from lerobot_roborecover.analysis.stats.ranking import StartRates, rank_agreement
 from lerobot_roborecover.analysis.stats.resampling import resample
+from lerobot_roborecover.analysis.stats.retries import share_within
 from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING
 
 SIZES = (8, 20, 64, 200)
@@ -125,6 +127,23 @@ def rates(replicates: int) -> Iterator[Line]:
         rng = rng_of("rates", n, k, name, p)
         y = rng.binomial(k, scenario_rates(rng, p, n, scatter, replicates)) / k
         yield held("rate", n, f"{k} trials, {name}, rate {p}", rate_interval(spread(y)), p)
+
+
+def retries(replicates: int) -> Iterator[Line]:
+    """RSR@k, success within k attempts: its estimand is the mean over scenarios of 1 - (1 - rate)^k."""
+    trials = 5
+    for n in SIZES:
+        for name, scatter in SCATTER.items():
+            for p in RATES:
+                for k in (2, 3, 5):
+                    rng, setting = rng_of("retries", n, k, name, p), f"{k} of {trials}, {name}, rate {p}"
+                    solved = rng.binomial(trials, scenario_rates(rng, p, n, scatter, replicates))
+                    lost = (1 - p) ** k
+                    if scatter is not None:  # the k-th moment of the beta distribution of 1 - rate
+                        j = np.arange(k)
+                        lost = np.prod(((1 - p) * scatter + j) / (scatter + j))
+                    within = share_within(solved, np.full(solved.shape, trials), k)
+                    yield held("RSR@k", n, setting, rate_interval(spread(within), rare=RARE), 1 - lost)
 
 
 def bootstrap(replicates: int) -> Iterator[Line]:

@@ -11,6 +11,7 @@ from lerobot_roborecover.analysis.gain_tables import gain_tables, inversions, ta
 from lerobot_roborecover.analysis.pair_tables import paired_contrasts, profiles, ranks
 from lerobot_roborecover.analysis.policy_tables import beside_published, outcomes, overall
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.retry_tables import retry_tables
 from lerobot_roborecover.analysis.robot_tables import robot_tables
 from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.stats.crossfit import oracle
@@ -54,9 +55,8 @@ def all_tables(results: Results) -> list[Table]:
         tables.append(sources_by_policy(results))
     if len(results.recovery.arms) > 1:
         tables.append(oracle_table(results))
-    tables += [
-        budgets(results), trial_metrics(results.recovery, results.draws), variance(results)
-    ]  # fmt: skip
+    tables += [budgets(results), *retry_tables(results)]
+    tables += [trial_metrics(results.recovery, results.draws), variance(results)]
     if results.costs:
         tables += [interventions(results), *gain_tables(results)]
     if published.policies(results.study.platform):

@@ -16,8 +16,16 @@ from lerobot_roborecover.analysis.stats.estimators import (
     invalid_counts,
     scenario_rates,
 )
-from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, estimate_of, rate_interval, spread
+from lerobot_roborecover.analysis.stats.intervals import (
+    LEVEL,
+    RARE,
+    Estimate,
+    estimate_of,
+    rate_interval,
+    spread,
+)
 from lerobot_roborecover.analysis.stats.macro import MACRO_9, MacroCells, macro_cells, macro_of_scenarios
+from lerobot_roborecover.analysis.stats.retries import ATTEMPTS, share_within
 from lerobot_roborecover.analysis.stats.units import WORDS, default_unit
 from lerobot_roborecover.scenario import DeviationType, Outcome, Stage, Start
 
@@ -67,6 +75,8 @@ class StartSummary:
     """Occupied cells, in the order of the paper's stages and types."""
     first_states: int
     """Of the scenarios."""
+    within: Mapping[int, Estimate]
+    """RSR@k by k from 2, as far as every scenario has k trials; empty of initial-state trials."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +126,18 @@ def _of_start(start: Start, rows: list[Mapping[str, Any]], scheduled: int | None
         without_infrastructure=_without_infrastructure(start, rows),
         cells=tuple(_of_cell(cell, scenarios.where(c == cell for c in scenarios.cells)) for cell in cells),
         first_states=len(set(scenarios.first_states)),
+        within={} if start is Start.INITIAL else _within(scenarios),
     )
+
+
+def _within(scenarios: ScenarioRates) -> dict[int, Estimate]:
+    most = int(scenarios.trials.min())
+    successes = np.rint(scenarios.rates * scenarios.trials).astype(int)
+    return {
+        k: rate_estimate(share_within(successes, scenarios.trials, k), scenarios.units, rare=RARE)
+        for k in ATTEMPTS
+        if 1 < k <= most
+    }
 
 
 def _rate_of(start: Start, scenarios: ScenarioRates) -> Estimate:
@@ -137,16 +158,19 @@ def _of_cell(cell: str, scenarios: ScenarioRates) -> CellSummary:
     return CellSummary(cell, len(scenarios), int(scenarios.trials.sum()), estimate)
 
 
-def rate_estimate(rates: np.ndarray, units: Sequence[str], level: float = LEVEL) -> Estimate:
+def rate_estimate(
+    rates: np.ndarray, units: Sequence[str], level: float = LEVEL, rare: float = 0.0
+) -> Estimate:
     """RSR with the interval that every table and page shows.
 
     Args:
         rates: (n,) in [0, 1].
         units: n labels of what is independent.
         level: confidence level.
+        rare: of RSR@k, see `rate_interval`.
     """
     found = spread(rates, units)
-    return estimate_of(found.value, rate_interval(found, level))
+    return estimate_of(found.value, rate_interval(found, level, rare))
 
 
 def _cell_order(cell: str) -> tuple[int, int]:
@@ -166,6 +190,7 @@ def format_table(summary: Summary) -> str:
             continue
         counts = f"{part.scenarios:>10}{part.trials:>8}{sum(part.invalid.values()):>9}"
         lines.append(f"{title:<26}{_rate(part.rsr)}{counts}")
+        lines += [f"{f'  within {k} attempts':<26}{_rate(found)}" for k, found in part.within.items()]
         if start is not Start.INITIAL:
             cells = part.macro_cells
             if cells.counted and not cells.is_macro_9:

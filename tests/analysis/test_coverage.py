@@ -46,7 +46,7 @@ def benchmark():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "part", ["rates", "tasks", "macro", "differences", "ratios", "steps", "agreement", "tests"]
+    "part", ["rates", "retries", "tasks", "macro", "differences", "ratios", "steps", "agreement", "tests"]
 )
 def test_intervals_cover_and_tests_are_right(benchmark, part):
     """The sizes 8 and 20 of the benchmark, where few samples still tell; seeded, so that it cannot flicker.

@@ -67,6 +67,8 @@ def test_everything_is_written(written):
         "source_matrix",
         "oracle",
         "budgets",
+        "retries",
+        "retry_budgets",
         "trial_metrics",
         "variance",
         "published",
@@ -82,6 +84,7 @@ def test_everything_is_written(written):
         "source_matrix",
         "paired_differences",
         "time_to_recover",
+        "retries",
         "oracle",
     }
     kinds = (".svg", ".png", "_narrow.svg")

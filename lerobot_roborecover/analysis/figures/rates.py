@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.figures.retries import retries
 from lerobot_roborecover.analysis.figures.runs import runs_figure
 from lerobot_roborecover.analysis.figures.style import (
     HEAT,
@@ -50,6 +51,8 @@ def all_figures(results: Results) -> list[Figure]:
     if several:
         figures.append(paired_differences(results))
     figures.append(time_to_recover(results))
+    if (found := retries(results)) is not None:
+        figures.append(found)
     if several:
         figures.append(oracle_bars(results))
     if results.costs:

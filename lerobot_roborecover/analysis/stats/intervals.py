@@ -12,6 +12,9 @@ says.
   Clopper and Pearson (1934) over the units. It holds whatever the rates of the scenarios and however many
   trials each has: at one mean rate, units that are alike fail all together most often. Units of unlike weight
   have its equivalent (`_all_alike`): the largest mean rate at which all fail with the chance left for it.
+- Success within k attempts (RSR@k) is near 1 for most scenarios and 0 for a few that hardly ever occur: the
+  scenarios at hand then scatter less than others like them. As many all-or-nothing units are mixed in as it
+  takes for `RARE` of them to fail.
 - A paired difference has Student's t with one unit more, half of it won by each side: what Bonett and Price
   (2012) do for pairs of yes and no.
 - A number that is no mean, such as F1 or the area under a curve, has the interval of a rate, its variance
@@ -34,6 +37,8 @@ from scipy import special
 
 LEVEL = 0.95
 """Confidence level unless another is asked for."""
+RARE = 3.0
+"""Of RSR@k: with as many units as it takes for three to fail, a failure is likely to be among them."""
 _TINY = 1e-12
 """Rounding of sums of rates; a variance or bound below it is none."""
 _LEAST_FREEDOM = 0.2
@@ -209,9 +214,15 @@ def estimates_of(values: float | np.ndarray, bounds: Bounds) -> list[Estimate]:
     return [Estimate(*parts) for parts in zip(*columns, strict=True)]
 
 
-def rate_interval(found: WeightedMean, level: float = LEVEL) -> Bounds:
+def rate_interval(found: WeightedMean, level: float = LEVEL, rare: float = 0.0) -> Bounds:
     """Interval of a mean of numbers from 0 to 1: Agresti-Coull with the effective number of units, or
     Clopper-Pearson where all units are 0 or all are 1.
+
+    Args:
+        found: the mean and its variance.
+        level: confidence level.
+        rare: all-or-nothing units that are mixed into the variance: so many that this number of them would
+            fail (or succeed, where that is rarer); at least one unit.
 
     Returns:
         Bounds in [0, 1]; NaN for fewer than two units, which say nothing about how they scatter.
@@ -221,7 +232,8 @@ def rate_interval(found: WeightedMean, level: float = LEVEL) -> Bounds:
     p = np.clip(value, 0.0, 1.0)
     own = p * (1 - p)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mixed = (freedom * variance + own / units) / (freedom + 1)
+        whole = np.maximum(1.0, rare / np.maximum(np.minimum(p, 1 - p), _TINY))
+        mixed = (freedom * variance + whole * own / units) / (freedom + whole)
         scatter = (variance > _TINY**2) & (mixed > 0)
         effective = np.where(scatter, own / mixed, units)
         count = effective + q * q

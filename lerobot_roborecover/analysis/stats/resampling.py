@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.estimators import DRAWS, draw_counts
 from lerobot_roborecover.analysis.stats.intervals import (
     LEVEL,
+    RARE,
     Bounds,
     Estimate,
     WeightedMean,
@@ -65,6 +66,10 @@ class Resampling:
             weights: (N, K) of the scenarios, by default all the same: a column is then a ratio of sums.
         """
         return self._columns(rate_interval, values, cells, weights)
+
+    def rates_of_retries(self, values: np.ndarray) -> list[Estimate]:
+        """Mean of each of (N, K) columns of shares within several attempts, with its interval."""
+        return self._columns(partial(rate_interval, rare=RARE), values)
 
     def differences(self, values: np.ndarray) -> list[Estimate]:
         """Mean of each of (N, K) columns of paired differences of rates, with its interval."""
