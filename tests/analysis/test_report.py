@@ -369,7 +369,7 @@ def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     policy = re.search('http-equiv="Content-Security-Policy" content="([^"]+)"', page)[1]
     assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} <= set(policy.split("; "))
     assert page.count('<li class="card"') == 6
-    assert page.count("data:video/mp4;base64,ZmlsbQ==") == 1
+    assert page.count("data:video/mp4;base64,dmlkZW8=") == 1
     other = fake_dataset(tmp_path / "other", 3)
     assert main(["report", str(runs), f"--out={out}", f"--scenarios={other}"]) == 2
     assert "3 scenario(s) that" in capsys.readouterr().err
