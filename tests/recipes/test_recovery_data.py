@@ -49,7 +49,7 @@ def test_mixtures_are_of_one_size_and_of_their_shares():
     for name, mixture in MIXTURES.items():
         marks = np.concatenate([e.actions[:, 0] for _, e in made[name]])
         assert np.mean(marks == 3.0) == pytest.approx(mixture.recoveries, abs=0.01)
-        assert set(marks) == ({2.0} if mixture.shaken else {1.0, 3.0} if mixture.recoveries else {1.0})
+        assert set(marks) == ({2.0} if mixture.perturbed else {1.0, 3.0} if mixture.recoveries else {1.0})
         assert {task for task, _ in made[name]} == {"a", "b"}
     alone = mixtures(some([30] * 20, 1.0), some([25] * 20, 2.0), [], {"clean": Mixture(0.0)})
     assert frames_of(alone["clean"]) == 500
