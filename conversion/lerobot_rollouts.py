@@ -1,6 +1,6 @@
 """Makes a trajectory dataset of rollouts from a LeRobotDataset, e.g. of `lerobot-eval --eval.recording=true`.
 
-    python conversion/lerobot_rollouts.py DATASET_FOLDER --platform libero --driver pi05 --out DIR
+    python conversion/lerobot_rollouts.py DATASET_FOLDER --platform libero --controller pi05 --out DIR
 
 Videos are copied, not encoded again. What cannot be replayed exactly is marked so: docs/publish.md.
 """
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("dataset", type=Path, help="folder of a LeRobotDataset (v3.0)")
     add("--out", type=Path, required=True, help="new folder of the dataset")
     add("--platform", required=True, choices=("libero", "metaworld", "robotwin"))
-    add("--driver", required=True, help="the policy that drove")
+    add("--controller", "--driver", dest="driver", required=True, help="the policy that acted")
     add("--task", help="the task's name, where the recorded instruction does not tell it")
     add("--suite", default="", help="where several suites have the task")
     add(

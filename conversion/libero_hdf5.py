@@ -40,7 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("files", nargs="+", type=Path, help="HDF5 files, one a task")
     parser.add_argument("--out", type=Path, required=True, help="new folder of the dataset")
     parser.add_argument("--suite", default="", help="where several suites have a task of the name")
-    parser.add_argument("--driver", default="human", help="who drove (%(default)s)")
+    parser.add_argument(
+        "--controller", "--driver", dest="driver", default="human", help="who acted (%(default)s)"
+    )
     parser.add_argument(
         "--license",
         type=license_argument,

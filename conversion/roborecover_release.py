@@ -181,7 +181,7 @@ def refuse_other_robots(result: Conversion, robotwin_root: str | None) -> None:
     try:
         robot = RobotwinCheckout(robotwin_root).robot
     except SimulatorError:
-        return  # whoever replays the set brings a robot, and every handoff compares it
+        return  # a replay brings its own robot, and every handoff compares it
     for scenario in list(result.scenarios):
         try:
             check_robot(robot, initial_state_of(scenario))

@@ -224,7 +224,7 @@ class Scenario(TrialStart):
     deviation: DeviationType
     source: Source
     source_policy: str = ""
-    """Who drove: the policy's name; for a perturbed rollout, the policy under the perturbation."""
+    """The controller: the policy's name; for a perturbed rollout, the policy under the perturbation."""
     split: str = "test"
     cluster: str = ""
     """Scenarios of one source trajectory share it; the resampling unit where trajectories yield several."""

@@ -92,7 +92,7 @@ class Hand(ABC):
 
     @abstractmethod
     def follow(self, t: int) -> bool:
-        """One action of the task's scripted driver; whether the task is solved."""
+        """One action of the task's scripted controller; whether the task is solved."""
 
     def act(self, velocity: np.ndarray, grip: float) -> None:
         """One command.
@@ -117,7 +117,7 @@ class Hand(ABC):
             self.act(np.zeros(3), grip)
 
     def carry(self, when: Callable[[], bool], most: int = 150) -> None:
-        """The scripted driver, until a condition holds.
+        """The scripted controller, until a condition holds.
 
         Raises:
             Fumbled: it never did.
@@ -127,10 +127,10 @@ class Hand(ABC):
                 return
             if self.follow(t):
                 raise Fumbled("the task was solved on the way")
-        raise Fumbled("the scripted driver did not get that far")
+        raise Fumbled("the scripted controller did not get that far")
 
     def grasp(self, far_m: float = 0.03) -> None:
-        """The scripted driver, until the object has gone along with the hand for so far."""
+        """The scripted controller, until the object has gone along with the hand for so far."""
         self.carry(lambda: self.carried(far_m))
 
     def up(self, grip: float, height_m: float) -> None:

@@ -3,9 +3,9 @@
 It is compared with never intervening and always intervening on scenarios that nothing was learned from.
 Plan and results: docs/studies/intervention_timing.md.
 
-    python -m recipes.stepping_in --platform libero --out outputs/stepping_in
-    python -m recipes.stepping_in --platform metaworld --out outputs/stepping_in_metaworld
-    python -m recipes.stepping_in --platform metaworld --out outputs/stored --stored
+    python -m recipes.intervention_timing --platform libero --out outputs/intervention_timing
+    python -m recipes.intervention_timing --platform metaworld --out outputs/intervention_timing_metaworld
+    python -m recipes.intervention_timing --platform metaworld --out outputs/stored --stored
 
 The training scenarios are divided, by what they share, into three parts. The first trains Correction
 (`curate donors`, `lerobot-train`). On the second, the base's trials are forked with that Correction, and
@@ -202,7 +202,7 @@ class SteppingIn:
 
 def stored_folder(platform: str) -> Path:
     """Returns the folder of a platform's stored outcomes."""
-    return OUTCOMES / f"stepping_in_{platform}"
+    return OUTCOMES / f"intervention_timing_{platform}"
 
 
 def report(logs: Mapping[str, Path], out: Path) -> None:
@@ -220,15 +220,18 @@ def main() -> None:
     add("--platform", choices=SUBJECTS, default="libero", help="(%(default)s)")
     add("--out", type=Path, required=True, help="folder to work in; a rerun goes on there")
     add("--scenarios", help="another set of the platform, with the splits train and test")
-    add("--every", type=int, help="fork every so many steps")
+    add("--stride", "--every", dest="every", type=int, help="fork every so many steps")
     add("--store", action="store_true", help="keep the outcomes with the code")
-    add("--stored", action="store_true", help="run nothing: report the outcomes kept with the code")
+    add(
+        "--use-stored-outcomes", "--stored", dest="stored", action="store_true",
+        help="run nothing: report the outcomes kept with the code",
+    )  # fmt: skip
     args = parser.parse_args()
     if args.stored:
         stored = stored_logs(stored_folder(args.platform))
         report({name: stored[name] for name in ARMS}, args.out)
         gains = fork_gains(read_trial_log(stored["forks"]))
-        tables = write_gains(gains, args.out / "forks", "python -m recipes.stepping_in --stored")
+        tables = write_gains(gains, args.out / "forks", "python -m recipes.intervention_timing --stored")
         print("\n".join(to_text(table) for table in tables[:2]))
         return
     subject = SUBJECTS[args.platform]

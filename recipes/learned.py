@@ -1,5 +1,5 @@
-"""A learned policy that drives a simulator directly: as a starter set's weak driver, or until an expert takes
-over."""
+"""A learned policy that acts in a simulator directly: as a starter set's weak controller, or until an expert
+takes over."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lerobot_roborecover.scenario import Task
 
 
 class LearnedPolicy:
-    """A LeRobot checkpoint that reads the low-dimensional state, run as `lerobot-eval` would: a driver.
+    """A LeRobot checkpoint that reads the low-dimensional state, run as `lerobot-eval` would: a controller.
 
     Args:
         simulator: made with `obs_type="state"`.
@@ -41,7 +41,7 @@ class LearnedPolicy:
         self._policy.reset()
 
     def __call__(self, _t: int) -> np.ndarray:
-        """See `Driver`."""
+        """See `Controller`."""
         import torch
         from lerobot.envs.utils import preprocess_observation
 

@@ -60,7 +60,7 @@ def test_help_is_light():
         ),
     ],
 )
-def test_gymnasium_knows_the_ids_whoever_is_imported_first(code):
+def test_gymnasium_knows_the_ids_in_any_order_of_imports(code):
     check = (
         f"{code}\nassert 'roborecover/Lerobot_pusht-v0' in gymnasium.registry"
         "\nimport inspect, sys; assert inspect.getsource(gymnasium)"

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_roborecover.platforms import Observation, Platform, SimulatorError
-from lerobot_roborecover.platforms.base import Driver, Expert
+from lerobot_roborecover.platforms.base import Controller, Expert
 from lerobot_roborecover.platforms.controls import Controls
 from lerobot_roborecover.scenario import Pose, Reset, Task
 
@@ -157,7 +157,7 @@ class CranePlatform(Platform):
 def _driver(hurry: float) -> Expert:
     """Drives to the mark and damps the swing; in a hurry it does not wait for the load."""
 
-    def make(simulator: CraneSimulator, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: CraneSimulator, task: Task, rng: np.random.Generator) -> Controller:
         def act(_t: int) -> np.ndarray:
             x, v, angle, turn = simulator.observe()["agent_pos"]
             away = MARKS_M[task.name] - x

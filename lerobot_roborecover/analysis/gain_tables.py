@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.contrasts import Contrast, contrasts
 from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW
-from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_controller
 from lerobot_roborecover.analysis.stats.intervals import UNDEFINED
 from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts
 from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
@@ -17,15 +17,15 @@ _NAN = float("nan")
 
 
 def gain_tables(results: Results) -> list[Table]:
-    """Returns the tables of gains by construction source and by driver."""
+    """Returns the tables of gains by construction source and by controller."""
     panel = results.interventions
     if panel is None:
         return []
-    by_source, by_driver = panel.labels("source"), groups_by_driver(panel)
+    by_source, by_controller = panel.labels("source"), groups_by_controller(panel)
     found = [_by_group(results, "gains_by_source", "Gains by construction source", "Source", by_source)]
-    if len(set(by_driver.tolist())) > len(set(by_source.tolist())):
-        title = "Gains by who was driving"
-        found.append(_by_group(results, "gains_by_driver", title, "Source, driver", by_driver))
+    if len(set(by_controller.tolist())) > len(set(by_source.tolist())):
+        title = "Gains by controller"
+        found.append(_by_group(results, "gains_by_controller", title, "Source, controller", by_controller))
     return found
 
 

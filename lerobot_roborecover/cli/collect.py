@@ -16,7 +16,7 @@ from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.workplace import add_workplace, workplace
 from lerobot_roborecover.datasets.licenses import license_argument
 
-HELP = "Roll out a policy or a scripted driver from initial states, and keep its failures as candidates."
+HELP = "Roll out a policy or a scripted controller from initial states, and keep its failures as candidates."
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -34,8 +34,8 @@ def build_parser() -> argparse.ArgumentParser:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's own arguments."""
     add = parser.add_argument
-    add("--expert", default="", metavar="NAME", help="a scripted driver instead of a policy; ? lists them")
-    add("--name", default="", help="recorded name of the driver (checkpoint, or expert)")
+    add("--expert", default="", metavar="NAME", help="scripted controller instead of a policy; ? lists them")
+    add("--name", default="", help="recorded name of the controller (checkpoint, or expert)")
     add("--out", type=Path, metavar="DIR", help="folder of the candidate dataset; needed to collect")
     add("--work", type=Path, metavar="DIR", help="folder of the rollouts, kept (OUT.work)")
     add(

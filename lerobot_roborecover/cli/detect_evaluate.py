@@ -10,7 +10,7 @@ from pathlib import Path
 from lerobot_roborecover.cli.old_options import renamed
 
 HELP = (
-    "Compare failure detectors side by side on a policy's own trials: who needs help, delays, false alarms a "
+    "Compare failure detectors side by side on a policy's own trials: ranking, delays, false alarms a "
     "minute, calibration, conformal thresholds, cost. With intervals over scenarios."
 )
 NEEDED = ("detector", "scenarios", "policy")

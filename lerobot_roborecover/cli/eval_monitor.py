@@ -10,7 +10,7 @@ from lerobot_roborecover.cli import detect_evaluate, detect_evaluate_frames
 HELP = (
     "Measure a trained monitor on held-out frames (--monitor, --data): accuracy, precision, recall, F1, "
     "Macro-F1, FPR, confusion counts, curves, trigger rate and detection delay. Or compare detectors side by "
-    "side on a policy's own trials (--detector, --scenarios, --policy): who needs help, delays, false alarms "
+    "side on a policy's own trials (--detector, --scenarios, --policy): ranking, delays, false alarms "
     "a minute, calibration, conformal thresholds, cost. With intervals over scenarios."
 )
 

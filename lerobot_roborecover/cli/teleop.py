@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, help="the candidate dataset: a new folder, or one that this command made")
     add("--platform", default="metaworld", help="which can be driven by hand, e.g. libero (%(default)s)")
-    add("--operator", metavar="NAME", help="who drives, or a pseudonym; goes into the dataset as the driver")
+    add("--operator", metavar="NAME", help="your name or a pseudonym; the controller in the dataset")
     add("--task", dest="tasks", action="append", default=[], metavar="NAME", help="repeat it for several")
     add("--suite", default="", help="where several suites have a task of that name")
     add("--seeds", metavar="LIST", help="of the starts, e.g. 0-9,12 (0; on LIBERO 7)")
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         if value is not None and not (low <= value <= high or (option == "--size" and value == 0)):
             raise OptionError(f"{option} {value} is not from {low:g} to {high:g}")
     if not (args.write or args.operator):
-        raise OptionError("--operator is missing: who drives, or a pseudonym")
+        raise OptionError("--operator is missing: your name, or a pseudonym")
     starts = first_states(args.platform, args.tasks, args.suite, args.seeds, args.init_states)
     for dataset, name, step in args.continued:
         if not step.isdecimal():

@@ -1,7 +1,7 @@
 """Candidate datasets: whole rollouts from which scenarios are built, and all that is known of each.
 
 A candidate dataset is a trajectory dataset of kind `rollouts` (`datasets/trajectories.py`): video, exact
-float64 actions, task, reset, driver. Beside that, in `meta/roborecover/`:
+float64 actions, task, reset, controller. Beside that, in `meta/roborecover/`:
 
 - `candidates.json`: one entry an episode, in the order of the episodes: id, source, suggestions; and the
   versions of the simulator that recorded them;
@@ -74,7 +74,7 @@ class Suggestion:
     step: int
     reason: str
     by: str
-    """The rule, the model, or `operator` for the person who drove."""
+    """The rule, the model, or `operator` for the person at the controls."""
     stage: str = ""
     """A `Stage`, or empty."""
     deviation: str = ""

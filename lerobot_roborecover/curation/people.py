@@ -54,7 +54,7 @@ class People:
     decisions: int = 0
     """That name a person."""
     operators: tuple[str, ...] = ()
-    """Drivers of human recordings: parts of ids, clusters and sources."""
+    """Controllers of human recordings: parts of ids, clusters and sources."""
 
     def __bool__(self) -> bool:
         return bool(self.names or self.votes or self.operators)
@@ -78,8 +78,8 @@ class People:
             )
         if self.operators:
             found.append(
-                f"operators PUBLISHED with it: {', '.join(self.operators)}; drivers of human recordings are "
-                "parts of ids and stay"
+                f"operators PUBLISHED with it: {', '.join(self.operators)}; they are parts of ids of human "
+                "recordings, and stay"
             )
         return found
 

@@ -1,4 +1,4 @@
-"""Rollouts of drivers that read the simulator's own state, and the paper's perturbation of actions."""
+"""Rollouts of controllers that read the simulator's own state, and the paper's perturbation of actions."""
 
 from __future__ import annotations
 

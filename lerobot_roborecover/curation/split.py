@@ -7,7 +7,7 @@ What two scenarios share that would leak from one split into another (paper, app
 - record: the same source record (`provenance.source_record`), or the same recovery state;
 - instruction: the same task and instruction. On RoboTwin, where instructions vary within a task; elsewhere
   all scenarios of a task share one;
-- start: the same task from the same reset (init state, seed), with any driver.
+- start: the same task from the same reset (init state, seed), with any controller.
 
 Scenarios that share anything, directly or through others, form a group that stays together. Groups of the
 same make-up (how many scenarios of each cell, source and suite) are interchangeable, so the sizes are an

@@ -76,8 +76,8 @@ def fingerprint_scenarios(
         return []
     platform = scenarios[0].platform
     options = dict(options or {}) if pool is None else pool.options
-    salt = _salt(platform, options)
-    keys = [hashlib.sha256(f"{s.sha256()} {salt}".encode()).hexdigest() for s in scenarios]
+    versions = _versions(platform, options)
+    keys = [hashlib.sha256(f"{s.sha256()} {versions}".encode()).hexdigest() for s in scenarios]
     file, done = _open_log(log)
     open_rows = [i for i, key in enumerate(keys) if key not in done]
     found: dict[int, Replayed] = {}
@@ -157,7 +157,7 @@ def _jobs(scenarios: Sequence[Scenario], rows: Sequence[int]) -> list[list[int]]
     ]
 
 
-def _salt(platform: str, options: Mapping[str, Any]) -> str:
+def _versions(platform: str, options: Mapping[str, Any]) -> str:
     found = platform_named(platform)
     versions = {name: installed(name) for name in found.required_versions}
     return json.dumps([versions, found.environment_fingerprint(options)])

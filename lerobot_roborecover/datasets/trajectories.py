@@ -48,7 +48,7 @@ class TrajectoryRow:
     task: dict[str, Any]
     """Platform, suite, name, instruction and horizon, as in `Task`."""
     driver: str
-    """The policy or person that drove."""
+    """The policy, person or script that acted."""
     steps: int
     success: bool
     actions_sha256: str

@@ -139,7 +139,7 @@ def fit_features(
     detector.fit(torch.cat(features), torch.cat(labels))
     _remember(detector, used)
     counts: Mapping[str, int] = detector.config.labels
-    return f"{counts['1']} steps that need help and {counts['0']} that do not, of {len(used)} trials"
+    return f"{counts['1']} steps of failing trials and {counts['0']} others, of {len(used)} trials"
 
 
 def fit_gain(

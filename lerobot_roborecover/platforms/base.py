@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from lerobot_roborecover.platforms.findings import Check
     from lerobot_roborecover.platforms.starts import Starts
 
-type Driver = Callable[[int], np.ndarray]
+type Controller = Callable[[int], np.ndarray]
 """Next action, (A,) float64, for the given step; reads the simulator's present state."""
 
 
 @dataclass(frozen=True)
 class Expert:
-    """A scripted driver, for `roborecover curate collect --expert`."""
+    """A scripted controller, for `roborecover curate collect --expert`."""
 
-    make: Callable[[Any, Task, np.random.Generator], Driver]
-    """From a simulator that was reset and has settled, the task, and the random stream of drivers that
+    make: Callable[[Any, Task, np.random.Generator], Controller]
+    """From a simulator that was reset and has settled, the task, and the random stream of controllers that
     draw."""
     about: str
     """A few words for a list of choices."""
@@ -116,7 +116,7 @@ class Platform(TaskCatalog):
     default_split: ClassVar[str] = ""
     """The split of the default set that is evaluated where neither a set nor a split is named; empty: all."""
     experts: ClassVar[Mapping[str, Expert]] = {}
-    """Scripted drivers by name."""
+    """Scripted controllers by name."""
     perturbable: ClassVar[bool] = True
     """Actions begin with normalised translations that `collect --perturb` can disturb."""
     why_not_perturbable: ClassVar[str] = ""
@@ -218,7 +218,7 @@ class Platform(TaskCatalog):
         return np.zeros(self.action_widths[0])
 
     def unsupported_reason(self, task: Task) -> str:
-        """Returns why the scripted drivers cannot do a task; empty where they can try."""
+        """Returns why the scripted controllers cannot do a task; empty where they can try."""
         return ""
 
     def short_name(self, task: Task) -> str:
@@ -333,7 +333,7 @@ class Platform(TaskCatalog):
     # --- the machine
 
     def examine(self, required: bool, recorded: Mapping[str, str]) -> list[Check]:
-        """The doctor's checks of what the platform needs beside packages: assets, drivers, checkouts.
+        """Returns the doctor's checks of what the platform needs beside packages: assets, checkouts.
 
         Args:
             required: what is missing is a failure rather than a warning.

@@ -34,7 +34,7 @@ class Controls:
     captions: Mapping[str, str] = field(default_factory=dict)
     """What a person should know of a camera, by LeRobot's name of it."""
     live_options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the simulator, for pictures that only the driver looks at: cheap ones."""
+    """Of the simulator, for pictures that only the controller looks at: cheap ones."""
 
     def action(self, axes: Sequence[float], closed: bool) -> np.ndarray:
         """(A,) float64.

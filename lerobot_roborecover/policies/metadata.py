@@ -129,7 +129,7 @@ def intervention_facts(config: Any) -> InterventionFacts:
     if "correction" in used:
         settings["correction_steps"] = config.correction_steps
     if config.mode == "human":
-        settings["driver"] = config.driver
+        settings["driver"] = config.controller  # the name that stored rows have
     return InterventionFacts(config.mode, config.rewind_steps, settings)
 
 

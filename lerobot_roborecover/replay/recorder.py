@@ -15,8 +15,8 @@ from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.scenario import Pose, Reset, Rollout, Task
 
 UNPERTURBED, PERTURBED, UNREACHABLE = 0, 1, 2
-"""What became of one action: executed as the driver gave it; perturbed; to be perturbed, but not reachable
-then, so that it was executed as given (paper, "Action-Perturbed Scenarios")."""
+"""What became of one action: executed as given; perturbed; to be perturbed, but not reachable then, so
+that it was executed as given (paper, "Action-Perturbed Scenarios")."""
 
 
 @dataclass(frozen=True)

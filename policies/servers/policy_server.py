@@ -114,8 +114,8 @@ def serve(infer, metadata=None, host="127.0.0.1", port=8000, max_frame_mb=64, st
         )
     if key is None and host not in LOOPBACK and not insecure:
         raise SystemExit(
-            f"host {host}: whoever reaches this address could use the policy. Set {API_KEY} here and at the "
-            "client, or listen on 127.0.0.1 and use an SSH tunnel, or call serve(..., insecure=True)"
+            f"host {host}: any client that reaches this address could use the policy. Set {API_KEY} here and "
+            "at the client, or listen on 127.0.0.1 and use an SSH tunnel, or call serve(..., insecure=True)"
         )
 
     def admit(connection, request):

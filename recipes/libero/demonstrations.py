@@ -2,14 +2,14 @@
 
 Objects stand where LIBERO's own placement draws them, as in LIBERO's demonstrations: none of the stored
 init states, from which policies are evaluated and scenarios are made, is among them. Every second episode is
-clean; in the others the arm is shaken for a while, while the recorded action stays the expert's, so that a
+clean; in the others the arm is perturbed for a while, while the recorded action stays the expert's, so that a
 policy trained on them has seen states beside the expert's path.
 
     python -m recipes.libero.demonstrations --out DIR --workers 2
     python -m recipes.libero.demonstrations --out RECOVERIES --after policies/libero/act_clean
     python -m recipes.libero.demonstrations --out DIR64 --parts DIR.parts --pictures 64 --suites libero_object
 
-With `--after`, policies drive first, every second one shaken, and the expert takes over at a step that is
+With `--after`, policies drive first, every second one perturbed, and the expert takes over at a step that is
 drawn, if the task is not solved by then: the episode begins there, and shows how to go on from where policies
 get.
 
@@ -33,7 +33,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
-from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.platforms.libero.expert import LiberoExpert
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
@@ -126,7 +126,7 @@ def place_again(simulator: LiberoSimulator, task: Task, placed: Mapping[str, np.
 
 
 def demonstration(
-    simulator: LiberoSimulator, task: Task, seed: int, shaken: bool, after: Driver | None = None
+    simulator: LiberoSimulator, task: Task, seed: int, perturbed: bool, after: Controller | None = None
 ) -> dict[str, np.ndarray] | None:
     """One successful episode of T steps, as arrays by LeRobot's names; None where the expert failed, or had
     nothing left to do.
@@ -135,13 +135,13 @@ def demonstration(
         simulator: with `obs_type="state"`.
         task: what to demonstrate.
         seed: of the placement and of the shaking.
-        shaken: disturb the executed actions for 20 to 100 steps from a step that is drawn.
-        after: drives before the episode begins, and is then what is shaken.
+        perturbed: disturb the executed actions for 20 to 100 steps from a step that is drawn.
+        after: drives before the episode begins, and is then what is perturbed.
     """
     rng = np.random.default_rng(seed)
     placed = place_freshly(simulator, task, seed)
     first = int(rng.integers(0, 60))
-    last = first + int(rng.integers(20, 100)) if shaken else first
+    last = first + int(rng.integers(20, 100)) if perturbed else first
     lead = []
     if after is not None:
         for t in range(int(rng.integers(_TAKEN_OVER[0], int(_TAKEN_OVER[1] * task.horizon)))):
@@ -150,7 +150,7 @@ def demonstration(
             simulator.step(lead[-1])
             if simulator.succeeded():
                 return None
-        last = first  # the expert itself is not shaken
+        last = first  # the expert itself is not perturbed
     placed["lead"] = np.array(lead).reshape(-1, 7)
     expert, seen, actions, executed, solved = LiberoExpert(LiberoScene(simulator)), [], [], [], []
     for t in range(task.horizon):

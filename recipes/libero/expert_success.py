@@ -3,7 +3,7 @@
     python -m recipes.libero.expert_success --inits 10 --rows expert.jsonl
 
 Finished rollouts are kept in the file of rows, so that a run can be interrupted; after a change to the
-drivers, name another file.
+controllers, name another file.
 """
 
 from __future__ import annotations

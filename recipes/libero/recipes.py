@@ -31,7 +31,7 @@ class Recipe:
     sees: str
     """What a viewer sees at the recovery point."""
     flaws: Flaws
-    """Of the driver."""
+    """Of the controller."""
     noise_seed: int | None = None
     """Seed of the paper's action perturbation; None for a natural failure."""
 
@@ -54,7 +54,7 @@ _OPEN_LOOP = Flaws(open_loop=True)
 
 
 def _flaws(**kinds: object) -> Flaws:
-    """Flaws of a driver that does not look, either."""
+    """Flaws of a controller that does not look, either."""
     return Flaws(open_loop=True, **kinds)
 
 

@@ -6,7 +6,7 @@ completes the task all the same.
 Starts the server of `curate teleop` and talks to it over its websocket, as the page does. The websocket does
 not carry what the scripted expert has to know of the scene. So the operator steps a simulator of its own with
 the same actions, and its state must equal the server's exactly. It replaces a person where none is available;
-its recordings name it as driver.
+its recordings name it as controller.
 """
 
 from __future__ import annotations

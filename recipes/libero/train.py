@@ -30,7 +30,7 @@ _SIDE = 64
 
 @dataclass(frozen=True)
 class Lessons:
-    """Which demonstrations a policy learns from. Every second one is clean, the others are shaken."""
+    """Which demonstrations a policy learns from. Every second one is clean, the others are perturbed."""
 
     taken: slice = slice(None)
     """Of each task's."""

@@ -1,6 +1,6 @@
 """Expert demonstrations of Meta-World tasks as a LeRobotDataset without images, for `lerobot-train`.
 
-Half of the episodes are clean. In the other half the arm is shaken at the start, while the recorded action
+Half of the episodes are clean. In the other half the arm is perturbed at the start, while the recorded action
 stays what the expert would have done, so that a policy trained on them has seen states beside the expert's
 path.
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.rollout import perturb_translations
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
-from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.experts import expert
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
@@ -65,19 +65,21 @@ class Episode(NamedTuple):
     observations: np.ndarray
     """(T, 39) float64, before each action."""
     actions: np.ndarray
-    """(T, 4) float64: the driver's, not what the arm was shaken with."""
+    """(T, 4) float64: the driver's, not what the arm was perturbed with."""
     solved: np.ndarray
     """(T,) bool, after each action."""
 
 
-def demonstration(simulator: MetaworldSimulator, task: Task, seed: int, shaken_steps: int) -> Episode | None:
+def demonstration(
+    simulator: MetaworldSimulator, task: Task, seed: int, perturbed_steps: int
+) -> Episode | None:
     """One successful expert episode.
 
     Args:
         simulator: with any `obs_type`.
         task: what to demonstrate.
         seed: of the reset and of the shaking.
-        shaken_steps: leading steps with the paper's perturbation on top of the executed action.
+        perturbed_steps: leading steps with the paper's perturbation on top of the executed action.
 
     Returns:
         The episode, or None where it did not succeed.
@@ -86,15 +88,15 @@ def demonstration(simulator: MetaworldSimulator, task: Task, seed: int, shaken_s
     simulator.reset(task, Reset(seed=seed))
     act = expert(simulator, task.name)
 
-    def shaken(t: int, action: np.ndarray) -> np.ndarray:
-        return perturb_translations(action, rng) if t < shaken_steps else action
+    def perturbed(t: int, action: np.ndarray) -> np.ndarray:
+        return perturb_translations(action, rng) if t < perturbed_steps else action
 
-    return record(simulator, act, _MAX_STEPS, shaken)
+    return record(simulator, act, _MAX_STEPS, perturbed)
 
 
 def record(
     simulator: MetaworldSimulator,
-    act: Driver,
+    act: Controller,
     max_steps: int,
     executed: Callable[[int, np.ndarray], np.ndarray] = lambda _t, action: action,
 ) -> Episode | None:
@@ -102,7 +104,7 @@ def record(
 
     Args:
         simulator: reset.
-        act: the driver, whose actions are recorded.
+        act: the controller, whose actions are recorded.
         max_steps: give up after these.
         executed: what becomes of the driver's action at a step.
 
@@ -156,7 +158,7 @@ def save_episode(dataset: Any, task: Task, episode: Episode) -> None:
 
 
 def save_demonstrations(
-    dataset: Any, simulator: MetaworldSimulator, name: str, count: int, shaken_steps: Callable[[int], int]
+    dataset: Any, simulator: MetaworldSimulator, name: str, count: int, perturbed_steps: Callable[[int], int]
 ) -> int:
     """Appends successful demonstrations of a task.
 
@@ -165,14 +167,14 @@ def save_demonstrations(
         simulator: any.
         name: of the task.
         count: how many.
-        shaken_steps: leading steps with perturbed actions, by how many demonstrations there are.
+        perturbed_steps: leading steps with perturbed actions, by how many demonstrations there are.
 
     Returns:
         Rollouts that it took.
     """
     task, found, seed = PLATFORM.task(name), 0, FIRST_SEED
     while found < count:
-        episode = demonstration(simulator, task, seed, shaken_steps(found))
+        episode = demonstration(simulator, task, seed, perturbed_steps(found))
         seed += 1
         if episode is not None:
             save_episode(dataset, task, episode)

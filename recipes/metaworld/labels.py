@@ -87,7 +87,7 @@ class Trace:
 def watch(
     simulator: MetaworldSimulator, task_name: str, act: Callable[[int], np.ndarray]
 ) -> tuple[Callable[[int], np.ndarray], Trace]:
-    """The driver, and the trace that fills while it drives."""
+    """The controller, and the trace that fills while it drives."""
     trace = Trace(task_name)
 
     def watched(t: int) -> np.ndarray:

@@ -3,7 +3,7 @@ are recoveries.
 
     python -m recipes.metaworld.recovery_data --out outputs/recovery_data
 
-Demonstrations of the study's tasks, clean and shaken; recoveries of the study's policies from the training
+Demonstrations of the study's tasks, clean and perturbed; recoveries of the study's policies from the training
 scenarios (`curate training-data --outcome successes`); mixtures of equal size; the study's `act` on each of
 them with several seeds; every result from the test scenarios' recovery points and initial states. What is
 finished is skipped. At the end, tables with intervals over runs and scenarios
@@ -45,8 +45,8 @@ class Mixture:
 
     recoveries: float
     """Share of its frames."""
-    shaken: bool = False
-    """Whether its demonstrations are shaken ones."""
+    perturbed: bool = False
+    """Whether its demonstrations are perturbed ones."""
 
 
 MIXTURES = {
@@ -54,9 +54,9 @@ MIXTURES = {
     "recoveries_10": Mixture(0.1),
     "recoveries_25": Mixture(0.25),
     "recoveries_50": Mixture(0.5),
-    "shaken": Mixture(0.0, shaken=True),
+    "shaken": Mixture(0.0, perturbed=True),
 }
-_SHAKEN_AT = 62.0
+_PERTURBED_AT = 62.0
 
 
 def make_recoveries(out: Path, pool: dict[str, int]) -> Path:
@@ -134,19 +134,19 @@ def frames_of(episodes: Iterable[tuple[str, Episode]]) -> int:
 
 def mixtures(
     clean: Sequence[tuple[str, Episode]],
-    shaken: Sequence[tuple[str, Episode]],
+    perturbed: Sequence[tuple[str, Episode]],
     recoveries: Sequence[tuple[str, Episode]],
     wanted: dict[str, Mixture],
 ) -> dict[str, list[tuple[str, Episode]]]:
     """Episodes by mixture, of as many frames each as every one of them can have."""
-    total = min(frames_of(clean), frames_of(shaken))
+    total = min(frames_of(clean), frames_of(perturbed))
     share = max((m.recoveries for m in wanted.values()), default=0.0)
     if share:
         total = min(total, int(frames_of(recoveries) / share))
     made = {}
     for name, mixture in wanted.items():
         part = round(mixture.recoveries * total)
-        demonstrations = shaken if mixture.shaken else clean
+        demonstrations = perturbed if mixture.perturbed else clean
         made[name] = [*draw(demonstrations, total - part), *draw(recoveries, part)]
     return made
 
@@ -201,20 +201,20 @@ def draw_curve(report: Path) -> Path:
     with drawing() as subplots:
         plot, axes = subplots(6.4, 3.6)
         for i, (label, values) in enumerate((("recovery", like_these), ("initial states", initial))):
-            for shaken in (False, True):
-                names = [n for n in values if MIXTURES[n].shaken is shaken]
+            for perturbed in (False, True):
+                names = [n for n in values if MIXTURES[n].perturbed is perturbed]
                 found = 100 * np.array([[values[n][k] for k in ("value", "low", "high")] for n in names])
                 if len(found):
                     places = [_place(n) + i * 0.6 for n in names]
                     spans = [found[:, 0] - found[:, 1], found[:, 2] - found[:, 0]]
                     axes.errorbar(
                         places, found[:, 0], spans, color=colour(i), marker=marker(i), ms=5, lw=1.4,
-                        capsize=3, ls="none" if shaken else dash(i), label=None if shaken else label,
+                        capsize=3, ls="none" if perturbed else dash(i), label=None if perturbed else label,
                     )  # fmt: skip
         axes.plot([_place(n) - 0.8 for n, _ in runs], [100 * v for _, v in runs], ".", color=colour(0), ms=4)
         shown = [n for n in MIXTURES if n in like_these]
         ticks = {
-            _place(n): "shaken" if MIXTURES[n].shaken else f"{MIXTURES[n].recoveries:.0%}" for n in shown
+            _place(n): "shaken" if MIXTURES[n].perturbed else f"{MIXTURES[n].recoveries:.0%}" for n in shown
         }
         axes.set_xticks(list(ticks), list(ticks.values()))
         axes.set_xlabel("share of the frames that are recoveries")
@@ -230,7 +230,7 @@ def draw_curve(report: Path) -> Path:
 def _place(name: str) -> float:
     """On the curve's axis, in per cent of recoveries; beyond its end what has no place on it."""
     mixture = MIXTURES[name]
-    return _SHAKEN_AT if mixture.shaken else 100 * mixture.recoveries
+    return _PERTURBED_AT if mixture.perturbed else 100 * mixture.recoveries
 
 
 def report(logs: Mapping[str, Path], out: Path) -> None:

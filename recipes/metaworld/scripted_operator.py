@@ -4,7 +4,7 @@ the task all the same.
     python -m recipes.metaworld.scripted_operator --out OUT --tasks study --seeds 500-505
 
 Starts the server of `curate teleop` and talks to it over its websocket, as the page does. It replaces a
-person where none is available, as in a rerun of the study; its recordings name it as driver.
+person where none is available, as in a rerun of the study; its recordings name it as controller.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.rollout import record
-from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.catalog import HORIZON
 from lerobot_roborecover.platforms.metaworld.experts import (
@@ -72,7 +72,7 @@ class Collection:
 
     source: Source
     policy: str
-    make: Callable[[MetaworldSimulator, str, np.random.Generator], Driver]
+    make: Callable[[MetaworldSimulator, str, np.random.Generator], Controller]
     seeds: range
     """Of the rollouts of each task."""
 
@@ -96,7 +96,7 @@ def collections(weak_policy: str | None, first_seed: int = 0, limits: Limits = S
     ]
     if weak_policy:
 
-        def learned(simulator: MetaworldSimulator, name: str, _rng: np.random.Generator) -> Driver:
+        def learned(simulator: MetaworldSimulator, name: str, _rng: np.random.Generator) -> Controller:
             return LearnedPolicy(simulator, PLATFORM.task(name), weak_policy)
 
         found.append(Collection(Source.NATURAL, WEAK_POLICY, learned, seeds(30)))
@@ -180,7 +180,9 @@ def prove(simulator: MetaworldSimulator, out: Path, limits: Limits = SHIPPED) ->
 def _attempts(simulator: MetaworldSimulator, out: Path, row: dict[str, Any]) -> dict[str, int | None]:
     """Steps to success by controller, None where it failed; up to the first that succeeds."""
     name = row["task"]
-    controllers: dict[str, Driver] = {} if row["policy"] == "expert" else {"expert": expert(simulator, name)}
+    controllers: dict[str, Controller] = (
+        {} if row["policy"] == "expert" else {"expert": expert(simulator, name)}
+    )
     for seed in PROOF_SEEDS:
         rng = np.random.default_rng(seed)
         controllers[f"patient_expert/{seed}"] = patient_expert(simulator, name, rng)
@@ -196,7 +198,7 @@ def _attempts(simulator: MetaworldSimulator, out: Path, row: dict[str, Any]) -> 
     return attempts
 
 
-def _steps_to_success(simulator: MetaworldSimulator, act: Driver) -> int | None:
+def _steps_to_success(simulator: MetaworldSimulator, act: Controller) -> int | None:
     for t in range(HORIZON):
         simulator.step(act(t))
         if simulator.succeeded():

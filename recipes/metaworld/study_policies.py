@@ -26,7 +26,7 @@ from recipes.metaworld.initial_success import evaluate, table
 from recipes.training import Training
 
 EPISODES_PER_TASK = 70
-"""Every second one is clean, the others are shaken."""
+"""Every second one is clean, the others are perturbed."""
 
 CONFIGS = Path("policies/train/study")
 POLICIES: dict[str, slice] = {

@@ -1,4 +1,4 @@
-"""Demonstrations of PushT by the scripted driver as a LeRobotDataset without images, for `lerobot-train`.
+"""Demonstrations of PushT by the scripted controller as a LeRobotDataset without images, for `lerobot-train`.
 
 In a third of the episodes the executed target is disturbed during the first steps, while the recorded action
 stays the driver's, so that a policy trained on them has seen states beside its path.
@@ -23,20 +23,20 @@ FIRST_SEED = 100_000
 """Seeds of demonstrations start here, as in PushT's published recipe those of its evaluation; scenarios use
 smaller ones."""
 _STEPS_AFTER_SUCCESS = 3
-_SHAKEN_STEPS = 60
-_SHAKEN = (25.0, 25.0)
+_PERTURBED_STEPS = 60
+_PERTURBATION = (25.0, 25.0)
 """Half-widths of the disturbance, pixels."""
 
 type Episode = list[dict[str, np.ndarray]]
 
 
-def demonstration(simulator: Any, seed: int, shaken: bool) -> Episode | None:
-    """One episode up to a few solved steps; None where the driver did not solve it.
+def demonstration(simulator: Any, seed: int, perturbed: bool) -> Episode | None:
+    """One episode up to a few solved steps; None where the controller did not solve it.
 
     Args:
         simulator: of `lerobot_pusht`.
         seed: of the reset and of the disturbance.
-        shaken: disturb the first steps.
+        perturbed: disturb the first steps.
     """
     platform = platform_named("lerobot_pusht")
     task, rng, frames, solved = platform.tasks()[0], np.random.default_rng(seed), [], 0
@@ -44,7 +44,9 @@ def demonstration(simulator: Any, seed: int, shaken: bool) -> Episode | None:
     act = platform.experts["expert"].make(simulator, task, rng)
     for t in range(task.horizon):
         action, seen = act(t), simulator.observe()
-        executed = perturb_translations(action, rng, _SHAKEN) if shaken and t < _SHAKEN_STEPS else action
+        executed = (
+            perturb_translations(action, rng, _PERTURBATION) if perturbed and t < _PERTURBED_STEPS else action
+        )
         simulator.step(executed)
         solved += simulator.succeeded()
         frames.append(
@@ -77,7 +79,7 @@ def write_demonstrations(root: Path, count: int) -> None:
     instruction = platform_named("lerobot_pusht").tasks()[0].instruction
     seed, found = FIRST_SEED, 0
     while found < count:
-        episode = demonstration(simulator, seed, shaken=seed % 3 == 0)
+        episode = demonstration(simulator, seed, perturbed=seed % 3 == 0)
         seed += 1
         if episode is None:
             continue

@@ -55,7 +55,7 @@ class _Arm:
     indices: list[int]
     """Of its six joints, in the articulation's active joints."""
     limits: np.ndarray
-    """(2, 6) lowest and highest values that the driver gives its joints."""
+    """(2, 6) lowest and highest values that the controller gives its joints."""
     link: Any
     tcp_in_link: np.ndarray
     """(4, 4): fingertip centre in the last link's frame; x points along the approach."""

@@ -1,4 +1,4 @@
-"""What a scripted driver does wrong, and what a person who looks at the recovery frame calls it."""
+"""What a scripted controller does wrong, and what a person who looks at the recovery frame calls it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HANDOVER = "handover_block"
 PAD_M = 0.01
 """Thickness of its pad."""
 
-type Driver = Callable[[BlockExpert, str, int], Iterator[np.ndarray]]
+type Controller = Callable[[BlockExpert, str, int], Iterator[np.ndarray]]
 """Actions up to the recovery point, for an expert at a task's start, the task and the seed."""
 
 
@@ -38,7 +38,7 @@ class Fault:
     sees: str
     """The recovery frame in words; `{first}`, `{second}` and `{last}` are the bodies in the order of
     handling, `{held}` the second one where there is one."""
-    drive: Driver
+    drive: Controller
     touches: bool = True
     """Whether a body other than the arms has to have moved for the fault to have happened."""
 
@@ -62,7 +62,7 @@ NAMES = {
 
 
 def drive(expert: BlockExpert, task: str, fault: str, seed: int) -> Iterator[np.ndarray]:
-    """Actions of a driver up to its fault, and a moment beyond, so that the scene rests."""
+    """Actions of a controller up to its fault, and a moment beyond, so that the scene rests."""
     yield from FAULTS[fault].drive(expert, task, seed)
     yield from expert.hold(4)
 

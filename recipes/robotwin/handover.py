@@ -1,4 +1,4 @@
-"""How the scripted driver hands a standing box from one arm to the other, in the air, and sets it down."""
+"""How the scripted controller hands a standing box from one arm to the other and sets it down."""
 
 from __future__ import annotations
 

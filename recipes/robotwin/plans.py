@@ -1,4 +1,4 @@
-"""How the scripted driver solves each task that it knows, from wherever things are."""
+"""How the scripted controller solves each task that it knows, from wherever things are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ORDERS = {
     "blocks_ranking_size": ("block1", "block2", "block3"),
     "handover_block": ("box",),
 }
-"""Bodies of a task in the order in which the driver handles them."""
+"""Bodies of a task in the order in which the controller handles them."""
 
 INSTRUCTIONS = {
     "stack_blocks_two": "Move the red block to the center, then stack the green block on top of it.",

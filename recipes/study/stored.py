@@ -78,7 +78,7 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
 
 def summary_tables(study: StudyDefinition, done: Sequence[StudyArm]) -> str:
     """Returns the tables of README.md and of the study's page as Markdown: policies, inverted pairs, and the
-    gains of interventions, over tasks and by who was driving.
+    gains of interventions, over tasks and by controller.
 
     Args:
         study: what.

@@ -14,7 +14,7 @@ from lerobot_roborecover.analysis.stats.calibration import as_probability, calib
 from lerobot_roborecover.analysis.stats.conformal import conformal_threshold, halves, least_rollouts
 from lerobot_roborecover.analysis.stats.detection import (
     DEVIATED,
-    NEEDS_HELP,
+    WILL_FAIL,
     ScoredTrial,
     alarms,
     detection_report,
@@ -92,7 +92,7 @@ def test_pairs_of_detectors():
     alike, apart = found["worse", "same"], found["worse", "better"]
     assert (alike.difference.value, alike.differing) == (0.0, 0)
     assert not alike.verdict.separated
-    roc = {n: r.rankings[NEEDS_HELP].roc.area.value for n, r in reports.items()}
+    roc = {n: r.rankings[WILL_FAIL].roc.area.value for n, r in reports.items()}
     assert apart.difference.value == pytest.approx(roc["worse"] - roc["better"])
     assert apart.verdict.value == "B is better"
     assert apart.difference.high < 0
@@ -117,14 +117,14 @@ def test_detectors_alike_are_seldom_told_apart():
     assert wrong <= 20, f"{wrong} of 200"  # of 5 %, more than 20 have a chance of 0.1 %
 
 
-def test_labels_say_who_needs_help():
+def test_labels_say_which_trials_fail():
     trials = [
         trial(0, [0.1, 0.2, 0.3], handoff=1),  # fails from its recovery point
         trial(1, [0.1, 0.2, 0.3], handoff=2, success=True),
         trial(2, [0.1, 0.2], start="initial", success=True),
-        trial(3, [0.1, 0.2], start="initial"),  # a clean rollout that fails: nobody knows where
+        trial(3, [0.1, 0.2], start="initial"),  # a clean rollout that fails: the step is unknown
     ]
-    deviated, help_ = frames_of(trials, DEVIATED), frames_of(trials, NEEDS_HELP)
+    deviated, help_ = frames_of(trials, DEVIATED), frames_of(trials, WILL_FAIL)
     assert list(zip(deviated.episode, deviated.step, deviated.label, strict=True)) == [
         (0, 0, 0), (0, 1, 1), (0, 2, 1), (1, 0, 0), (1, 1, 0), (1, 2, 1),
     ]  # fmt: skip
@@ -196,8 +196,8 @@ def test_a_detector_that_knows_is_told_from_one_that_does_not():
             blind.append(trial(i, rng.normal(0.0, 0.5, 30), start=start, success=success))
     good = detection_report(trials, alpha=0.2, probabilities=False, decides=False)
     bad = detection_report(blind, alpha=0.2, probabilities=False, decides=False)
-    assert good.rankings[NEEDS_HELP].roc.area.low > 0.95
-    area = bad.rankings[NEEDS_HELP].roc.area
+    assert good.rankings[WILL_FAIL].roc.area.low > 0.95
+    area = bad.rankings[WILL_FAIL].roc.area
     assert area.low < 0.5 < area.high
     assert good.conformal.helped.value > 0.9
     assert good.conformal.clean_alarmed.value <= 0.3

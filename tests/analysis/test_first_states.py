@@ -16,7 +16,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.policy_tables import initial_estimates, overall
 from lerobot_roborecover.analysis.stats.detection import ScoredTrial, detection_report
-from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_controller
 from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts
 from lerobot_roborecover.analysis.stats.soundness import barred_arms
 from lerobot_roborecover.analysis.stats.units import ResamplingUnit
@@ -160,7 +160,7 @@ def test_gains_name_the_group_that_carries_them(tmp_path):
     study = read_study([str(write_log(tmp_path / "log.jsonl", rows))])
     results = analyse(study, replace(QUICK, baseline="base"))
     panel = results.interventions
-    groups, draws = groups_by_driver(panel), results.resample(panel)
+    groups, draws = groups_by_controller(panel), results.resample(panel)
     found = gains_by_group(panel, results.intervention_pairs, groups, draws)
     on = {gain.group: gain for gain in found}
     assert on["perturbed, expert"].inside.difference.value == 0.5

@@ -21,7 +21,7 @@ COUNT = 12
 
 @pytest.fixture(scope="module")
 def space(tmp_path_factory):
-    """Boards of two policies on a shipped set, and of one on a set that nobody has."""
+    """Boards of two policies on a shipped set, and of one on a set that is not available."""
     root = tmp_path_factory.mktemp("space")
     scenarios = list(load_scenarios("metaworld_starter"))[:COUNT]
     for seed, policy in enumerate(("me/alpha@1", "me/beta@2")):

@@ -1,4 +1,4 @@
-"""No option that somebody types today vanishes, or means something else, unnoticed."""
+"""No option of today vanishes or changes its meaning unnoticed."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def test_two_single_files_of_one_name_are_one_scenario_and_a_refusal(tmp_path, c
     assert len(load_scenarios(tmp_path / "out" / "libero")) == 1
 
 
-# --- refusals that speak to somebody who downloaded the data
+# --- refusals for users who downloaded the data
 
 
 def edited(**fields):
@@ -171,7 +171,7 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 @pytest.mark.parametrize("table", [True, False])
-def test_a_bad_record_has_a_remedy_for_whoever_downloaded_it(tmp_path, capsys, case, table):
+def test_a_bad_record_has_a_remedy_for_its_user(tmp_path, capsys, case, table):
     change, text, words = BAD[case]
     value = record()
     if change:

@@ -211,7 +211,7 @@ def test_a_build_that_waits_names_a_command_that_is_accepted(tmp_path, monkeypat
     assert [line for line in lines if line.endswith(": runs")][1].startswith("[stage 2 of 7, ")
 
 
-def test_scripted_drivers_are_listed_without_an_out(capsys):
+def test_scripted_controllers_are_listed_without_an_out(capsys):
     assert main(["collect", "--expert", "?"]) == 0
     every = capsys.readouterr().out
     assert "metaworld" in every

@@ -176,12 +176,12 @@ def test_perturbation_is_the_papers_and_stops_where_the_platform_cannot_follow(t
 
     import lerobot_roborecover.curation.collect.server as server
 
-    original = server.make_driver
-    server.make_driver = lambda *_: Straight()
+    original = server.make_controller
+    server.make_controller = lambda *_: Straight()
     try:
         drive(CollectServer(config()), tmp_path, replace(scenario, task=replace(TASK, horizon=60)))
     finally:
-        server.make_driver = original
+        server.make_controller = original
     record = read_record(record_path(tmp_path, scenario.id))
     settle = scenario.reset.settle_steps
     noise = stream(5, "perturbation", TASK, scenario.reset, 0)

@@ -119,7 +119,7 @@ def test_a_policy_collects_the_same_whatever_the_slots(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--seeds=0"], "who drives"),
+        (["--seeds=0"], "give either --policy"),
         (["--seeds=0", "--expert=expert", "--policy.path=x"], "not both"),
         (["--expert=exprt", "--seeds=0"], "pushes the puck"),
         (["--expert=expert"], "--seeds 0-29"),
@@ -233,17 +233,17 @@ def test_a_dry_run_lists_the_rollouts(tmp_path, capsys):
 
 
 @pytest.mark.libero
-def test_tasks_that_a_scripted_driver_cannot_do_are_left_out_by_name(tmp_path, capsys, monkeypatch):
+def test_tasks_that_a_scripted_controller_cannot_do_are_left_out_by_name(tmp_path, capsys, monkeypatch):
     monkeypatch.delitem(goals.PREDICATES, "turnon")
     command = ["collect", "--env.type=roborecover_libero", "--expert=scripted", "--init-states=0"]
     command += ["--dry-run", f"--out={tmp_path / 'out'}"]
     assert main([*command, "--task=libero_goal"]) == 0
     said = capsys.readouterr()
     assert "9 rollouts" in said.out
-    assert "libero_goal/turn_on_the_stove (no scripted driver knows turnon flat_stove_1)" in said.err
+    assert "libero_goal/turn_on_the_stove (no scripted controller knows turnon flat_stove_1)" in said.err
     assert main([*command, "--task=libero_goal/turn_on*"]) == 2
     said = capsys.readouterr().err
-    assert "can drive none of these tasks" in said
+    assert "can do none of these tasks" in said
     assert "--policy.path=CHECKPOINT" in said
 
 

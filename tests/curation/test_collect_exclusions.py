@@ -56,8 +56,8 @@ def test_erratic_motion(share):
     path = np.concatenate([[[0, 0, 0]], np.cumsum(sign[:, None] * [[0.004, 0, 0]], axis=0)])
     found = rules.judge(record_of(path), only=("erratic",))
     assert (found is not None) == (share == 0.5)
-    shaken = np.full(201, PERTURBED, np.int8)  # noise on purpose is nobody's fault
-    assert rules.judge(record_of(path, flags=shaken), only=("erratic",)) is None
+    perturbed = np.full(201, PERTURBED, np.int8)  # noise on purpose is no fault
+    assert rules.judge(record_of(path, flags=perturbed), only=("erratic",)) is None
 
 
 @pytest.mark.parametrize(("steps", "out"), [(rules.OUTSIDE_STEPS - 1, False), (rules.OUTSIDE_STEPS, True)])
@@ -118,7 +118,7 @@ def test_pressing_without_moving(moves, out):
     actions = np.tile([0.0, 0.0, -1.0, 0.0], (201, 1))
     found = rules.judge(record_of(path, actions=actions))
     assert (found is not None and found.rule == "pressing") == out
-    assert rules.judge(record_of(path)) is None  # nobody tells it to move
+    assert rules.judge(record_of(path)) is None  # no action moves it
 
 
 def test_rules_are_known_by_name():

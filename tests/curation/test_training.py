@@ -98,7 +98,7 @@ def test_a_rollback_is_taken_out_of_the_line():
     row = row_of(scenario, actions, False, interventions=[back | {"by": "fork"}], options={"fork": note})
     line = line_of_trial(scenario, row, actions)
     assert (line.first, line.steps, line.actions[line.first :, 0].tolist()) == (2, 4, [12, 14, 16, 18])
-    # Another policy's actions are somebody else's, from the fork on.
+    # From the fork on, the actions are another policy's.
     note = note | {"arm": "policy:p"}
     line = line_of_trial(scenario, row_of(scenario, actions, False, options={"fork": note}), actions)
     assert line.intervention.tolist() == [False] * 6 + [True] * 4
@@ -123,7 +123,9 @@ def test_returns_values_and_advantages_by_hand():
     assert found[0] == pytest.approx([(-1 - 0.1) / 2, -1])  # alike: b's first and c's; b's second
     assert found[1] == pytest.approx([(-0.2 - 0.1) / 2, -0.1, -0.5 / 4])  # its last: all others of the task
     assert found[2] == pytest.approx([(-0.2 - 1) / 2])
-    assert values([lines[0]])[0] == pytest.approx([-0.2, -0.1])  # nobody to compare with: no advantage
+    assert values([lines[0]])[0] == pytest.approx(
+        [-0.2, -0.1]
+    )  # no other trial to compare with: no advantage
 
 
 @pytest.mark.lerobot

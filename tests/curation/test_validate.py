@@ -301,7 +301,7 @@ def test_a_rerun_replays_nothing_and_people_decide(validated, tmp_path, monkeypa
     shutil.copytree(root / "out", tmp_path / "out")
     shutil.copytree(root / "out.replays", tmp_path / "out.replays")
     argv = [*argv, "--out", str(tmp_path / "out")]
-    # Whoever starts a process fails.
+    # Starting a process fails.
     monkeypatch.setattr("lerobot_roborecover.workers.slots.WorkerSlot.__init__", None)
     first = read_scenarios(root / "out")[0].id
     assert main([*argv, "--reject", first, "--reason", "the puck is off the table", "--by", "ann"]) == 0

@@ -135,7 +135,7 @@ def test_what_the_hub_refuses_is_one_clear_line_and_no_version(hub, client, loca
 
 
 @pytest.mark.slow
-def test_a_commit_by_somebody_else_in_between_is_not_overwritten(hub, client, local, tmp_path):
+def test_a_commit_of_another_client_in_between_is_not_overwritten(hub, client, local, tmp_path):
     client.publish(local)
     script = CLI.replace(
         "sys.exit(main(sys.argv[1:]))",

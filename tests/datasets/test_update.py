@@ -147,7 +147,7 @@ def test_one_update_at_a_time_and_none_of_a_file_in_use(source, tmp_path):
         (None, "no update of this package"),
     ],
 )
-def test_an_update_that_somebody_else_wrote_is_refused(source, tmp_path, text, words):
+def test_an_update_of_another_program_is_refused(source, tmp_path, text, words):
     root, victim = tmp_path / "set", tmp_path / "victim"
     shutil.copytree(source, root)
     victim.write_text("mine")

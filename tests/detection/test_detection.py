@@ -112,7 +112,7 @@ def test_numbers_page_and_strips(measured):
     assert pairs["constant", "knn"]["family"] == 15
     scores = np.load(measured / "scores" / "knn.npz")
     assert scores["length"].sum() == len(scores["score"])
-    # The oracle knows what nobody knows in use.
+    # The oracle knows what is unknown in use.
     assert not (measured / "detectors" / "oracle").exists()
     saved = json.loads((measured / "detectors" / "knn" / "config.json").read_text())
     assert saved["threshold"] == pytest.approx(found["knn"]["conformal_threshold"], abs=1e-5)

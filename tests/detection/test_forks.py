@@ -292,7 +292,7 @@ def test_every_arm(policies, logs, dataset, tmp_path):
     kind = "diffusion"
     arms = [
         "fresh", f"policy:{policies[kind]}", f"rollback:{BACK}", f"correction:{policies['act']}",
-        "human:tests.support.small_interventions:scripted_driver",
+        "human:tests.support.small_interventions:scripted_controller",
     ]  # fmt: skip
     found = forked(policies, logs, kind, tmp_path / "out", arms, choice=Choice(at=(0, 6)), correction_steps=3)
     by: dict[tuple, dict] = {}

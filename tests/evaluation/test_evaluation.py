@@ -21,7 +21,7 @@ from tests.support.loop import outcomes
 EXAMPLE = Path(__file__).parents[2] / "examples" / "training" / "evaluate_while_training.py"
 pytestmark = pytest.mark.lerobot
 QUIET = {"slots": 2, "max_batch": 1, "progress": False}
-"""One observation an inference: it then rounds alike whoever else is waiting."""
+"""One observation an inference: it then rounds alike, whatever other trials wait."""
 
 
 @pytest.fixture(scope="module")

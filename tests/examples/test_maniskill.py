@@ -1,4 +1,4 @@
-"""`examples/maniskill`: a simulator that nobody built this for, as a platform of its own distribution."""
+"""`examples/maniskill`: a simulator from outside, as a platform of its own distribution."""
 
 from __future__ import annotations
 

@@ -9,17 +9,17 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.policies.runner import PolicyError
 from lerobot_roborecover.workers.control_columns import BY_RULE, Controller, strip_columns
-from tests.support.small_interventions import CountingMember, ScriptedDriver, observation
+from tests.support.small_interventions import CountingMember, ScriptedController, observation
 
 pytestmark = pytest.mark.lerobot
 
 
-def director(mode, *, monitor=None, driver=None, correction_steps=5):
+def director(mode, *, monitor=None, takeover=None, correction_steps=5):
     from lerobot_roborecover.policies.interventions.controller import InterventionController
 
     members = {Controller.BASE: CountingMember(1.0, 4), Controller.CORRECTION: CountingMember(2.0, 3)}
     return InterventionController(
-        members, mode, monitor=monitor, driver=driver, correction_steps=correction_steps
+        members, mode, monitor=monitor, takeover=takeover, correction_steps=correction_steps
     )
 
 
@@ -92,18 +92,18 @@ def test_a_monitored_rollback_takes_a_turn_and_flushes_the_queue():
 
 
 def test_a_person_takes_over_and_hands_back():
-    driver = ScriptedDriver(3)
-    driver.act = lambda slot, seen: (
+    takeover = ScriptedController(3)
+    takeover.act = lambda slot, seen: (
         None if not slot["left"] else (slot.update(left=slot["left"] - 1), np.full(3, 5.0, np.float32))[1]
     )
-    made = director("human", monitor=At(), driver=driver)
+    made = director("human", monitor=At(), takeover=takeover)
     rows, _ = run_alone(made, [1, 9, 0, 0, 0, 0, 0])
     assert [r[0] for r in rows] == [1, 5, 5, 5, 1, 1, 1]
-    assert [s["over"] for s in driver.taken] == [True]
-    made = director("human", driver=driver)  # without a monitor: from the recovery point
+    assert [s["over"] for s in takeover.taken] == [True]
+    made = director("human", takeover=takeover)  # without a monitor: from the recovery point
     rows, _ = run_alone(made, [0, 0])
     assert [r[0] for r in rows] == [5, 5]
-    assert driver.taken[-1]["over"], "a trial that ends while a person drives lets go of the slot"
+    assert takeover.taken[-1]["over"], "a trial that ends while a person drives lets go of the slot"
 
 
 @settings(max_examples=30, deadline=None)

@@ -70,7 +70,7 @@ def composite(checkpoints, mode, *, base="act", correction="diffusion", **option
         correction_steps=7,
         rewind_steps=6,
         device="cpu",
-        driver="tests.support.small_interventions:scripted_driver",
+        controller="tests.support.small_interventions:scripted_controller",
         **options,
     )
     policy = make_policy(config, env_cfg=ENV_TYPES["fake"]())
@@ -154,7 +154,7 @@ def test_a_person_at_the_page_takes_over_under_both_evaluators(
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     made, taker = composite(checkpoints, "human"), Takeover(0)
-    made[0].director._driver = taker
+    made[0].director._takeover = taker
 
     def person(client: Client) -> None:
         while not over.is_set():
@@ -283,8 +283,8 @@ def test_commands_save_reload_and_resume(lerobot_eval, dataset, checkpoints, mon
         (["--policy.mode=undo"], "not one of direct"),
         (["--policy.mode=reversion", "--policy.rewind_steps=0"], "from 1 to"),
         (["--policy.mode=reversion", "--env.start=initial"], "beyond the start"),
-        (["--policy.mode=human"], "needs --policy.driver"),
-        (["--policy.mode=human", "--policy.driver=nowhere:nothing"], "cannot be made"),
+        (["--policy.mode=human"], "needs --policy.controller"),
+        (["--policy.mode=human", "--policy.controller=nowhere:nothing"], "cannot be made"),
         (["--policy.mode=correction", "--policy.correction.path={wide}"], "its action space is"),
         (["--policy.mode=correction", "--policy.correction.path={camera}"], "trained on cameras"),
         (["--policy.mode=monitor_reversion", "--policy.monitor.path=m"], "gives no observation.images.top"),

@@ -156,7 +156,7 @@ def test_rewards_become_scores(kind, request):
     assert fallen.scores[1] == pytest.approx(rewards[2] - rewards[5], abs=1e-5)
     assert fallen.triggers.all()
     assert not ask(whole, seen, [3]).triggers.any()
-    # Whoever shares the batch: the same.
+    # The same in any batch.
     alone = [ask(falls, seen, [n]).scores[0] for n in (5, 11)]
     np.testing.assert_allclose(alone, fallen.scores[1:], atol=1e-5)
 

@@ -1,4 +1,4 @@
-"""LIBERO's scripted drivers: each kind solves a task of its own, from the start and from the middle."""
+"""LIBERO's scripted controllers: each kind solves a task of its own, from the start and from the middle."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_each_kind_of_goal_is_solved(simulator, number):
 
 
 def test_a_knob_is_turned_from_the_middle(simulator):
-    """A driver that starts with the fingers closed on nothing, low over the table."""
+    """A controller that starts with the fingers closed on nothing, low over the table."""
     task, reset = start("goal:7", 2)
     simulator.reset(task, reset)
     for _ in range(12):

@@ -85,7 +85,7 @@ def test_a_recipe_makes_its_scenario_again(scenarios, simulator):
     recipe = min(RECIPES, key=lambda r: r.step)
     shipped = next(s for s in scenarios if s.id == recipe.id)
     again = roll_out(simulator, recipe, steps=recipe.step - 10)
-    # The driver looks at where things are: another processor rounds otherwise (see `exactness`).
+    # The controller looks at where things are: another processor rounds otherwise (see `exactness`).
     np.testing.assert_allclose(again.rollout.actions, shipped.prefix, rtol=0, atol=1e-6)
     assert prove(simulator, shipped) == shipped.provenance["proof"]["steps"]
 

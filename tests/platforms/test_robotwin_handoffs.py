@@ -1,4 +1,4 @@
-"""Handoffs on RoboTwin: exact for every shipped scenario; from snapshots only where somebody asks for it."""
+"""Handoffs on RoboTwin: exact for every shipped scenario; from snapshots only on request."""
 
 from __future__ import annotations
 

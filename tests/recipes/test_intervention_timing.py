@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.curation.split import start_of
-from recipes.stepping_in import PARTS, divide
+from recipes.intervention_timing import PARTS, divide
 from tests.support.factories import fake_scenario
 
 SCENARIOS = [fake_scenario(i, steps=3) for i in range(120)]

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.analysis.stats.detection import NEEDS_HELP
+from lerobot_roborecover.analysis.stats.detection import WILL_FAIL
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
+from recipes.intervention_timing import ARMS, stored_folder
 from recipes.metaworld.recovery_data import STORED as RECOVERY_DATA
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
-from recipes.stepping_in import ARMS, stored_folder
 from tests.support.trial_rows import policy_rows, write_log
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -79,7 +79,7 @@ def test_the_page_on_detectors_says_what_is_stored(name):
     found = read_comparison(OUTCOMES / name)
     assert len(found.measured) == 9
     for detector in found.measured:
-        area = detector.report.rankings[NEEDS_HELP].roc.area
+        area = detector.report.rankings[WILL_FAIL].roc.area
         alarmed = detector.report.conformal.clean_alarmed
         for value in (area, alarmed):
             shown = f"{100 * value.value:.1f} [{100 * value.low:.1f}, {100 * value.high:.1f}]"

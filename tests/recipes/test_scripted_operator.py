@@ -126,7 +126,7 @@ def test_a_stopped_operator_goes_on(tmp_path, monkeypatch):
     assert asked == [0, 1, 2, 4, 5], "nothing is driven twice"
     assert record(config, turns, one(None)) == {"dropped": 1, "beside": 1}
     assert len(asked) == 5
-    # Whoever takes the recordings away begins anew.
+    # Without the recordings it begins anew.
     shutil.rmtree(tmp_path / "set.recordings")
     assert record(config, turns, one(None)) == {"dropped": 1, "beside": 1}
     assert len(asked) == 10

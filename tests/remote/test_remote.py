@@ -212,7 +212,7 @@ def test_bad_introductions(metadata, error, words):
         server.close()
 
 
-def test_nobody_there_and_somebody_else():
+def test_no_server_and_another_server():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{free.getsockname()[1]}"
@@ -248,7 +248,7 @@ def test_requests_travel_at_once():
     together = threading.Barrier(4, timeout=PATIENCE_S)
 
     def infer(request, connection):
-        together.wait()  # nobody is answered before all four have come
+        together.wait()  # no answer before all four have come
         return {"n": request["n"]}
 
     with OpenpiServer(infer).running() as url:

@@ -110,7 +110,9 @@ def test_a_server_that_stays_away_ends_the_run_and_the_same_command_goes_on(eval
     with fake.running() as url:
         policy = remote(url, write_mapping(tmp_path), name="p", give_up_after=2)
         rows = evaluate(*policy, status=2)
-        assert [r.outcome for r in rows] == ["horizon"], "what nobody answered is no failure of the policy"
+        assert [r.outcome for r in rows] == ["horizon"], (
+            "a request without an answer is no failure of the policy"
+        )
         assert "2 times in a row" in capsys.readouterr().err
         fake.requests.clear()
         alive[0] = True

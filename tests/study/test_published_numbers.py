@@ -13,7 +13,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_driver
+from lerobot_roborecover.analysis.stats.gains import gains_by_group, groups_by_controller
 from lerobot_roborecover.analysis.stats.macro import macro_9_estimates, macro_estimates
 from lerobot_roborecover.analysis.stats.ranking import pairs_from_both_starts, rank_agreement
 from lerobot_roborecover.analysis.stats.units import ResamplingUnit
@@ -117,7 +117,9 @@ def test_one_inversion_is_shown_on_meta_world_and_none_over_tasks(results):
 def test_one_disturbed_expert_carries_libero_s_gains(results):
     _, found = results
     panel = found.interventions
-    gains = gains_by_group(panel, found.intervention_pairs, groups_by_driver(panel), found.resample(panel))
+    gains = gains_by_group(
+        panel, found.intervention_pairs, groups_by_controller(panel), found.resample(panel)
+    )
     expert = [g for g in gains if g.group == "perturbed, scripted-open-loop"]
     assert [round(100 * g.outside.difference.value, 1) for g in expert] == [1.0, 9.5, 1.0, 9.5]
     assert [round(g.outside.p_holm, 2) for g in expert] == [1, 0.19, 1, 0.17]

@@ -65,7 +65,7 @@ class Forked:
 
 
 def _run(script: str, argv: list[str], env: dict[str, str], folder: str, stdout: str, stderr: str) -> None:
-    assert "huggingface_hub" not in sys.modules, "it would keep the settings of whoever imported it"
+    assert "huggingface_hub" not in sys.modules, "it would keep the settings of its importer"
     for descriptor, path in ((1, stdout), (2, stderr)):
         opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         os.dup2(opened, descriptor)

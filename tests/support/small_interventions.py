@@ -34,7 +34,7 @@ class HashMonitor:
         return Verdicts(scores, (scores > self.threshold) | np.isnan(scores))
 
 
-class ScriptedDriver:
+class ScriptedController:
     """A person who drives `steps` steps to the left and is done."""
 
     def __init__(self, steps: int = 4):
@@ -57,9 +57,9 @@ class ScriptedDriver:
         slot["over"] = True
 
 
-def scripted_driver():
-    """What `--policy.driver=tests.support.small_interventions:scripted_driver` calls."""
-    return ScriptedDriver()
+def scripted_controller():
+    """What `--policy.controller=tests.support.small_interventions:scripted_controller` calls."""
+    return ScriptedController()
 
 
 class CountingMember:

@@ -240,7 +240,7 @@ def test_annotators_are_blind_to_each_other_and_to_who_drove(annotators):
 
 
 def test_nothing_that_an_annotator_receives_tells_ids_drivers_or_folders(dataset, tmp_path, capfd):
-    """Ids and folders' names say who drove and what was perturbed, errors included."""
+    """Ids and folders' names name the controller and what was perturbed, errors included."""
     root = tmp_path / "scripted-perturbed"
     shutil.copytree(dataset, root)
     candidates = read_candidates(root)
@@ -261,7 +261,7 @@ def test_nothing_that_an_annotator_receives_tells_ids_drivers_or_folders(dataset
     for answer in answers:
         whole = answer.text + str(answer.url) + str(answer.headers)
         assert not [word for word in ("ep-0", "scripted", "noise", str(tmp_path)) if word in whole], whole
-    # Whoever runs the server is told which one it is.
+    # The server's operator is told which one it is.
     assert f"episode {name} ({ann.called.candidates[name]}): {root}" in capfd.readouterr().err
     journal = read_journal(tmp_path / "votes/ann.jsonl", 1)
     assert {r["candidate"] for r in journal if r["kind"] == "vote"} == {f"ep-000{i}" for i in range(6)}

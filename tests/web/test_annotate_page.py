@@ -303,7 +303,7 @@ def test_buttons_take_tab_enter_and_space_and_a_first_visit_opens_the_guide(serv
         first: ("recovery", 10, "Approach", "Wrong Pose", ""),
         second: ("discard", None, "", "", "no_deviation"),
     }
-    # Names for people, and nothing that would tell who drove.
+    # Names for people, and nothing that would tell the controller.
     assert page.locator("#cameras figcaption").all_inner_texts() == ["top camera", "wrist camera"]
     assert page.locator('#keys [data-row="action"] span').all_inner_texts() == ["action 1", "action 2"]
     seen = page.evaluate("document.title + location + document.body.innerHTML + JSON.stringify(localStorage)")

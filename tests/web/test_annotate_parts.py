@@ -71,9 +71,9 @@ def test_traces_and_suggestions_follow_the_bodies():
     puck, eef = place.copy(), place.copy()
     puck[:, 0] = np.clip(np.arange(STEPS + 1) - 10, 0, 5) * 0.01
     eef[:, 1] = np.clip(20 - np.arange(STEPS + 1), 0, 20) * 0.05
-    shaken = replace(steps, bodies={"eef": eef, "puck": puck[::-1]})
-    assert list(traces("fake", actions, shaken, 20).object_speed_m_s) == ["puck"]
-    assert not traces("fake", actions, shaken, 20, settle_steps=36).object_speed_m_s
+    perturbed = replace(steps, bodies={"eef": eef, "puck": puck[::-1]})
+    assert list(traces("fake", actions, perturbed, 20).object_speed_m_s) == ["puck"]
+    assert not traces("fake", actions, perturbed, 20, settle_steps=36).object_speed_m_s
     found = suggest(replace(steps, bodies={"eef": eef, "puck": puck}), 20, 3)
     assert [(s.step, s.by) for s in found] == [(15, "rule"), (20, "rule")]
 

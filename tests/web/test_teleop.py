@@ -393,7 +393,7 @@ def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_pa
 
 
 def test_nobody_drives_blind(tmp_path):
-    """Steps wait for pictures that the driver has not shown yet, whatever others have."""
+    """Steps wait for pictures that the controller has not shown yet, whatever others have."""
     with cockpit(tmp_path / "r", [first_state("fake", "push-left", seed=3)]) as found:
         eyes = Eyes(found)
         eyes.read(lambda m: m.get("phase") == "preview")
@@ -522,7 +522,7 @@ def test_a_simulator_that_breaks_ends_its_recording_and_not_the_server(tmp_path)
         assert client.act([0, 0])["step"] == 1
 
 
-def test_whoever_watches_does_not_drive(address):
+def test_a_watching_page_does_not_control(address):
     with Client(address) as first, Client(address) as second:
         with pytest.raises(TeleopRefusal, match="another page drives"):
             first.act([0, 0])

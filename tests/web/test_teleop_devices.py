@@ -19,7 +19,7 @@ from tests.support.processes import PATIENCE_S
 
 
 class Clock:
-    """Time that passes only where somebody waits, whatever this machine is busy with."""
+    """Time that passes only during waits, whatever this machine is busy with."""
 
     def __init__(self):
         self.now_s = 100.0
@@ -74,7 +74,7 @@ def test_time_passes_only_while_something_is_held(clock):
     assert [t.axes for t in clock.ticks(pilot, 0.1)] == [ONE], "also where the simulator was busy meanwhile"
     pilot.hold("keyboard", ONE)
     held = clock.ticks(pilot, 1.2)
-    assert len(held) in (30, 31), "nobody holds it any more after 0.6 seconds"
+    assert len(held) in (30, 31), "it is released after 0.6 seconds"
     pilot.hold("keyboard", NONE, wait=True)
     assert {t.axes for t in clock.ticks(pilot, 0.1)} == {NONE}
     pilot.let_go()

@@ -61,7 +61,7 @@ def test_the_same_results_as_here_and_the_same_refusals(cluster):
     assert outcome.kind == "hung"
 
 
-def test_whoever_stops_asking_leaves_nothing_at_work(cluster):
+def test_an_abandoned_iterator_leaves_nothing_at_work(cluster):
     cluster.complete()
     with JobPool("fake", workers=2, workplace=RAY) as pool:
         for item, _ in pool.run(work, ["a", "hangs", "b"]):

@@ -93,7 +93,7 @@ def test_a_fresh_process_for_each_and_a_limit_for_it():
     assert outcome.kind == "hung"
 
 
-def test_whoever_stops_asking_leaves_nothing_at_work():
+def test_an_abandoned_iterator_leaves_nothing_at_work():
     with JobPool("fake", workers=2) as pool:
         for item, (pid, _) in pool.run(work, ["a", "hangs", "b"]):
             assert item in "ab"

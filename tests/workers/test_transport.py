@@ -137,6 +137,6 @@ def _plain(value):
 
 
 def test_a_system_without_such_memory_is_none_the_worse(monkeypatch):
-    """Whoever has no `memfd_create` goes on with the socket."""
+    """Without `memfd_create` the socket is used."""
     monkeypatch.delattr(transport.os, "memfd_create", raising=False)
     assert make_memory() is None

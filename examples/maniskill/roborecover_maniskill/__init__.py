@@ -77,7 +77,7 @@ class ManiSkillPlatform(Platform):
         return {"obs_type": "pixels_agent_pos", "observation_size": size} if size else {"obs_type": "state"}
 
     def unsupported_reason(self, task: Task) -> str:
-        """The scripted drivers know some tasks."""
+        """The scripted controllers know some tasks."""
         return "" if task.name in PLANS else "it is not scripted"
 
     def env_config(self) -> type:

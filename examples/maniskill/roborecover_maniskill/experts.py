@@ -1,4 +1,4 @@
-"""Scripted drivers for ManiSkill's tasks, from the simulator's own state.
+"""Scripted controllers for ManiSkill's tasks, from the simulator's own state.
 
 ManiSkill's motion planners drive absolute joint positions and step the environment themselves; these give
 one delta of the hand (Panda) or of the joints (SO-100) at a time, which `collect --perturb` can disturb.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_roborecover.platforms.base import Driver, Expert
+from lerobot_roborecover.platforms.base import Controller, Expert
 from lerobot_roborecover.platforms.simulator import GOAL
 from lerobot_roborecover.scenario import Task
 
@@ -90,8 +90,8 @@ class _So100:
 
 
 class _Hand:
-    """One driver at work: what it sees, and where it goes. `open_loop` looks once, at the beginning; objects
-    seem to be `error_m` off at least and at most, horizontally."""
+    """One controller: what it sees, and where it goes. `open_loop` looks once, at the beginning; objects seem
+    to be `error_m` off at least and at most, horizontally."""
 
     def __init__(
         self, simulator: Any, rng: np.random.Generator, open_loop: bool, error_m: tuple[float, float]
@@ -201,7 +201,7 @@ def _cut(values: np.ndarray, most: float) -> np.ndarray:
 
 
 def _expert(about: str, open_loop: bool = False, error_m: tuple[float, float] = (0.0, 0.0)) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         hand = _Hand(simulator, rng, open_loop, error_m)
 
         def drive() -> Plan:

@@ -24,7 +24,7 @@ from lerobot_roborecover.analysis.figures.style import (
     number,
     short,
 )
-from lerobot_roborecover.analysis.stats.detection import NEEDS_HELP, DetectionReport, Ranking, ScoredTrial
+from lerobot_roborecover.analysis.stats.detection import WILL_FAIL, DetectionReport, Ranking, ScoredTrial
 from lerobot_roborecover.analysis.stats.monitor_curves import Curve
 
 type Reports = Mapping[str, DetectionReport]
@@ -55,7 +55,7 @@ def _roc(reports: Reports) -> Figure:
         axes.plot([0, 1], [0, 1], ":", color=SOFT, lw=1)
         axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="false-positive rate", ylabel="recall")
         _finish(axes, "lower right")
-    return Figure("detectors_roc", "Who needs help: ROC, with the area", words, plot)
+    return Figure("detectors_roc", "Failure label: ROC, with the area", words, plot)
 
 
 def _precision(reports: Reports) -> Figure:
@@ -63,11 +63,11 @@ def _precision(reports: Reports) -> Figure:
         plot, axes = subplots(5.2, 4.6)
         words = _ranked(axes, reports, lambda ranking: ranking.precision_recall)
         for report in reports.values():
-            if NEEDS_HELP in report.rankings:
-                axes.axhline(report.rankings[NEEDS_HELP].positive, color=SOFT, ls=":", lw=1)
+            if WILL_FAIL in report.rankings:
+                axes.axhline(report.rankings[WILL_FAIL].positive, color=SOFT, ls=":", lw=1)
         axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
         _finish(axes, "lower left")
-    title = "Who needs help: precision and recall, with the area; dotted: share of frames"
+    title = "Failure label: precision and recall, with the area; dotted: share of frames"
     return Figure("detectors_precision_recall", title, words, plot)
 
 
@@ -75,9 +75,9 @@ def _ranked(axes: Any, reports: Reports, curve_of: Callable[[Ranking], Curve]) -
     """One curve a detector that ranks at all, each with its area; the same in words."""
     words = []
     for i, (name, report) in enumerate(reports.items()):
-        if NEEDS_HELP not in report.rankings:
+        if WILL_FAIL not in report.rankings:
             continue
-        curve = curve_of(report.rankings[NEEDS_HELP])
+        curve = curve_of(report.rankings[WILL_FAIL])
         area = number(curve.area.value, ".2f")
         axes.plot(curve.x, curve.y, dash(i), color=colour(i), lw=1.6, label=f"{short(name, 22)} {area}")
         words.append(f"{name} {area}")
@@ -116,7 +116,7 @@ def _reliability(reports: Reports) -> Figure:
             )  # fmt: skip
             words.append(f"{name}: ECE {number(found.ece.value, '.2f')}")
         axes.plot([0, 1], [0, 1], ":", color=SOFT, lw=1)
-        axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="probability said", ylabel="share that needs help")
+        axes.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="probability said", ylabel="share that fails")
         _finish(axes, "upper left")
     return Figure("detectors_reliability", "Reliability, with the calibration error", "; ".join(words), plot)
 

@@ -21,7 +21,7 @@ from lerobot_roborecover.analysis.pages.page import picture, render_page
 from lerobot_roborecover.analysis.stats.contrasts import Contrast
 from lerobot_roborecover.analysis.stats.detection import (
     DEVIATED,
-    NEEDS_HELP,
+    WILL_FAIL,
     Alarms,
     DetectionReport,
     ScoredTrial,
@@ -58,7 +58,7 @@ class MeasuredDetector:
 def ranking_table(measured: Sequence[MeasuredDetector], level: float) -> Table:
     """How well scores tell frames apart, and whether they mean what they say."""
     columns = (
-        Column("Detector"), Column("AUROC, needs help", "percent"), Column("AP, needs help", "percent"),
+        Column("Detector"), Column("AUROC, failure", "percent"), Column("AP, failure", "percent"),
         Column("AUROC, deviated", "percent"), Column("AP, deviated", "percent"), Column("Brier", "ratio"),
         Column("ECE", "ratio"), Column("ms a call", "number"),
     )  # fmt: skip
@@ -66,7 +66,7 @@ def ranking_table(measured: Sequence[MeasuredDetector], level: float) -> Table:
     shares: dict[str, float] = {}
     for m in measured:
         cells: list[Cell] = [m.name]
-        for label in (NEEDS_HELP, DEVIATED):
+        for label in (WILL_FAIL, DEVIATED):
             found = m.report.rankings.get(label)
             cells += [found.roc.area, found.precision_recall.area] if found else [UNDEFINED, UNDEFINED]
             if found:
@@ -75,7 +75,7 @@ def ranking_table(measured: Sequence[MeasuredDetector], level: float) -> Table:
     base = ", ".join(f"{100 * v:.1f} % of the frames labelled `{k}`" for k, v in shares.items())
     notes = (
         f"In per cent with {100 * level:g} % intervals over scenarios (docs/statistics.md, Intervals). "
-        "Needs help: 1 from the recovery point on in a trial that fails, 0 in one that succeeds and in "
+        "Failure: 1 from the recovery point on in a trial that fails, 0 in one that succeeds and in "
         "successful clean rollouts. Deviated: 1 from the recovery point on, 0 before it. A detector that "
         f"knows nothing has AUROC 50 and as AP the share of label 1: {base}. Brier and ECE are of needing "
         "help; scores that are no probabilities go through Platt's curve, fitted to the other half of the "
@@ -131,7 +131,7 @@ def pair_table(found: Sequence[Contrast], level: float) -> Table:
     )  # fmt: skip
     rows = tuple((c.a, c.b, c.difference, c.p, c.p_holm, c.verdict.value) for c in found)
     notes = (
-        f"AUROC of needs help, paired over {found[0].units} scenarios by the jackknife; intervals are not "
+        f"AUROC for failure, paired over {found[0].units} scenarios by the jackknife; intervals are not "
         f"adjusted, p (Holm) is, for these {found[0].family} pairs. Verdict: p (Holm) below {1 - level:.3g}.",
     )
     return Table("pairs", "Which ranks better", columns, rows, notes)

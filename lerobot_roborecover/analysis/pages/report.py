@@ -39,7 +39,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("oracle", "oracle", ("oracle",)),
     ("time", "time_to_recover", ("budgets", "trial_metrics")),
     ("retries", "retries", ("retries", "retry_budgets")),
-    ("interventions", "interventions", ("interventions", "gains_by_source", "gains_by_driver")),
+    ("interventions", "interventions", ("interventions", "gains_by_source", "gains_by_controller")),
     ("outcomes", "outcomes", ("outcomes",)),
     ("uncertainty", "", ("variance",)),
     ("published", "", ("published",)),

@@ -1,6 +1,6 @@
 """Evaluates a detector on whole trials: which trials it flags, how early, and what false alarms cost.
 
-A frame has two labels. `deviated` is the paper's: 0 before the recovery point, 1 from it on. `needs help` is
+A frame has two labels. `deviated` is the paper's: 0 before the recovery point, 1 from it on. `WILL_FAIL` is
 the failure label: whether the acting policy fails to recover by itself.
 
 - Frames from the recovery point on: 1 in a trial that fails, 0 in a trial that succeeds.
@@ -24,7 +24,7 @@ from lerobot_roborecover.analysis.stats.monitor import MonitorFrames
 from lerobot_roborecover.analysis.stats.monitor_curves import Curve, precision_recall, roc
 from lerobot_roborecover.analysis.stats.resampling import resample
 
-DEVIATED, NEEDS_HELP = "deviated", "needs help"
+DEVIATED, WILL_FAIL = "deviated", "needs help"
 _MINUTE_S = 60.0
 
 
@@ -45,7 +45,7 @@ class ScoredTrial:
     scores: np.ndarray
     """(T,) float64, of each step's observation, replayed ones first; NaN where it said nothing."""
     decisions: np.ndarray
-    """(T,) bool: it asked for help by its own threshold; all False where it has none."""
+    """(T,) bool: alarms at its own threshold; all False where it has none."""
 
     @property
     def clean(self) -> bool:
@@ -112,7 +112,7 @@ class DetectionReport:
     """Everything about one detector."""
 
     rankings: dict[str, Ranking]
-    """By label: `DEVIATED`, `NEEDS_HELP`; without one that has no frames of both kinds."""
+    """By label: `DEVIATED`, `WILL_FAIL`; without one that has no frames of both kinds."""
     conformal: Alarms
     """At thresholds that promise a false-alarm rate, each half of the scenarios at that of the other."""
     own: Alarms | None
@@ -129,7 +129,7 @@ def frames_of(trials: Sequence[ScoredTrial], label: str) -> MonitorFrames | None
 
     Args:
         trials: of one detector.
-        label: `DEVIATED` or `NEEDS_HELP`.
+        label: `DEVIATED` or `WILL_FAIL`.
     """
     columns: dict[str, list[np.ndarray]] = {
         n: [] for n in ("scenario", "episode", "step", "label", "score", "decision", "recovery_step")
@@ -162,7 +162,7 @@ def _labels(trial: ScoredTrial, label: str) -> np.ndarray:
             found[trial.handoff :] = 1
         else:
             found[trial.handoff :] = int(not trial.success)
-    elif trial.success and label == NEEDS_HELP:
+    elif trial.success and label == WILL_FAIL:
         found[trial.handoff :] = 0
     return found
 
@@ -188,7 +188,7 @@ def alarms(
 
     Args:
         trials: of one detector.
-        fired: (T - handoff,) bool for each: it asks for help at that step.
+        fired: (T - handoff,) bool for each: whether it alarms at that step.
         level: confidence level.
         threshold: that they come from.
     """
@@ -267,7 +267,7 @@ def detection_report(
     clean = one_of_each_unit(trials)
     limits = tuple(conformal_threshold(highest[clean & (half != h)], alpha) for h in (0, 1))
     fired = [t.after > limits[h] for t, h in zip(trials, half, strict=True)]
-    labels = (DEVIATED, NEEDS_HELP)
+    labels = (DEVIATED, WILL_FAIL)
     return DetectionReport(
         rankings={label: found for label in labels if (found := rank(trials, label, level)) is not None},
         conformal=alarms(trials, fired, level, threshold=limits),
@@ -280,9 +280,7 @@ def detection_report(
 def _calibrated(
     trials: Sequence[ScoredTrial], half: np.ndarray, probabilities: bool, level: float
 ) -> Calibration:
-    by_half = [
-        frames_of([t for t, h in zip(trials, half, strict=True) if h == k], NEEDS_HELP) for k in (0, 1)
-    ]
+    by_half = [frames_of([t for t, h in zip(trials, half, strict=True) if h == k], WILL_FAIL) for k in (0, 1)]
     curves = [None if f is None else platt(f.score, f.label) for f in by_half]
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for k, frames in enumerate(by_half):

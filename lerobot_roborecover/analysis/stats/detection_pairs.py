@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.contrasts import Contrast, adjusted
-from lerobot_roborecover.analysis.stats.detection import NEEDS_HELP, DetectionReport
+from lerobot_roborecover.analysis.stats.detection import WILL_FAIL, DetectionReport
 from lerobot_roborecover.analysis.stats.intervals import (
     LEVEL,
     difference_interval,
@@ -30,14 +30,14 @@ def detector_contrasts(
     against: Sequence[str] = (),
     level: float = LEVEL,
 ) -> list[Contrast]:
-    """Differences of AUROC for `NEEDS_HELP`, one family; detectors that have none are left out.
+    """Differences of AUROC for `WILL_FAIL`, one family; detectors that have none are left out.
 
     Args:
         reports: by name, of the same trials in the same order.
         against: names; only pairs with one of them are asked about. Empty: all pairs.
         level: confidence level.
     """
-    curves = {n: r.rankings[NEEDS_HELP].roc for n, r in reports.items() if NEEDS_HELP in r.rankings}
+    curves = {n: r.rankings[WILL_FAIL].roc for n, r in reports.items() if WILL_FAIL in r.rankings}
     pairs = [
         (a, b) if b in against or not against else (b, a)
         for a, b in combinations(curves, 2)

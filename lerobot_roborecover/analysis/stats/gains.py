@@ -51,7 +51,7 @@ def _gains(
     return contrasts(panel.rates[:, scenarios], panel.arms, resampling.part(scenarios), turned)
 
 
-def groups_by_driver(panel: Panel) -> np.ndarray:
+def groups_by_controller(panel: Panel) -> np.ndarray:
     """(N,) str: construction source and the policy or program whose rollout led to the scenario."""
     drivers = panel.labels("source_policy")
     return np.array(

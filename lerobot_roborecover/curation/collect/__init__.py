@@ -1,1 +1,1 @@
-"""Rollouts become candidates: starts, drivers, perturbation, recording, exclusions."""
+"""Rollouts become candidates: starts, controllers, perturbation, recording, exclusions."""

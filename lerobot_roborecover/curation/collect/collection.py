@@ -22,7 +22,7 @@ from lerobot_roborecover.curation.collect.judge import verdict
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.collect.rollouts import RolloutJournal
 from lerobot_roborecover.curation.collect.run import PARTS_FOLDER, render_and_write, roll_out
-from lerobot_roborecover.curation.collect.settings import claim, differences, driver_of, settings_of
+from lerobot_roborecover.curation.collect.settings import claim, controller_of, differences, settings_of
 from lerobot_roborecover.curation.collect.starts import RolloutSpec, make_units
 from lerobot_roborecover.curation.collect.write import read_about
 from lerobot_roborecover.curation.funnel import StageCounts, attrition_table, count_stages, read_decisions
@@ -140,11 +140,11 @@ def _units(options: CollectOptions, env: Any, say: Callable[[str], None]) -> lis
         tasks = _drivable(options.expert, tasks, say)
     if options.horizon:
         tasks = [replace(task, horizon=options.horizon) for task in tasks]
-    return make_units(tasks, options.starts, driver_of(options), own.no_op(), perturbed=options.perturb)
+    return make_units(tasks, options.starts, controller_of(options), own.no_op(), perturbed=options.perturb)
 
 
 def _drivable(expert: str, tasks: Sequence[Task], say: Callable[[str], None]) -> list[Task]:
-    """Tasks that the scripted driver can try; says which are left out, and why.
+    """Tasks that the scripted controller can try; says which are left out, and why.
 
     Raises:
         ScenarioError: there is none.
@@ -154,11 +154,11 @@ def _drivable(expert: str, tasks: Sequence[Task], say: Callable[[str], None]) ->
     left_out = [f"{task.suite}/{task.name} ({why})" for task, why in why_not.items() if why]
     if not able:
         raise ScenarioError(
-            f"--expert {expert} can drive none of these tasks: {'; '.join(left_out)}. Choose others with "
+            f"--expert {expert} can do none of these tasks: {'; '.join(left_out)}. Choose others with "
             "--task, or collect from a policy with --policy.path=CHECKPOINT"
         )
     if left_out:
-        say(f"left out, because {expert} cannot drive them: {'; '.join(left_out)}")
+        say(f"left out, because {expert} cannot do them: {'; '.join(left_out)}")
     return able
 
 

@@ -1,4 +1,4 @@
-"""The scripted drivers of a platform, for `roborecover curate collect --expert`."""
+"""The scripted controllers of a platform, for `roborecover curate collect --expert`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.platforms import all_platforms, platform_named
-from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.scenario import ScenarioError, Task
 
 
-def make_driver(name: str, simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
-    """A driver for a simulator that has been reset and has settled.
+def make_controller(name: str, simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
+    """A controller for a simulator that has been reset and has settled.
 
     Args:
         name: of the platform's experts.
         simulator: of the task's platform.
         task: what to drive.
-        rng: of drivers that draw.
+        rng: of controllers that draw.
     """
     return platform_named(task.platform).experts[name].make(simulator, task, rng)
 
@@ -34,18 +34,18 @@ def check_expert(platform: str, name: str) -> None:
         return
     if not known:
         raise ScenarioError(
-            f"--expert {name}: {platform} has no scripted driver here; use --policy.path=CHECKPOINT"
+            f"--expert {name}: {platform} has no scripted controller here; use --policy.path=CHECKPOINT"
         )
     there = "; ".join(f"{n} ({expert.about})" for n, expert in known.items())
     raise ScenarioError(f"--expert {name!r:.80}: {platform} has {there}")
 
 
 def list_experts(platform: str = "") -> str:
-    """The scripted drivers of a platform, or of every one, a line each."""
+    """The scripted controllers of a platform, or of every one, a line each."""
     lines = [
         f"{found.name:<12}{name:<24}{expert.about}"
         for found in all_platforms()
         for name, expert in found.experts.items()
         if platform in ("", found.name)
     ]
-    return "\n".join(lines) or f"{platform} has no scripted driver here; use --policy.path=CHECKPOINT"
+    return "\n".join(lines) or f"{platform} has no scripted controller here; use --policy.path=CHECKPOINT"

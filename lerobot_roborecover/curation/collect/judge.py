@@ -65,7 +65,7 @@ def scene_disturbance(record: Record, twin: Record) -> SceneDisturbance:
 
     Args:
         record: the perturbed rollout.
-        twin: same driver, same start, same noise, undisturbed.
+        twin: same controller, same start, same noise, undisturbed.
     """
     best, best_score = SceneDisturbance("", 0.0, 0.0), -1.0
     others = objects_of(twin)

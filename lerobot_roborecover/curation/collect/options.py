@@ -41,9 +41,9 @@ class CollectOptions:
     policy: str = ""
     """Folder or Hub id of a checkpoint; or else:"""
     expert: str = ""
-    """Name of a scripted driver."""
+    """Name of a scripted controller."""
     name: str = ""
-    """Recorded name of the driver; by default the checkpoint's identity, or the expert's name."""
+    """Recorded name of the controller; by default the checkpoint's identity, or the expert's name."""
     work: Path | None = None
     """Working folder; by default beside `out`. Another collection from the same rollouts shares it."""
     env: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class CollectOptions:
     perturbed_steps: int = PERTURBED_STEPS
     judging: FilterConfig = field(default_factory=FilterConfig)
     seed: int = 7
-    """Of the perturbation, of the policy's noise, and of drivers that draw."""
+    """Of the perturbation, of the policy's noise, and of controllers that draw."""
     horizon: int = 0
     """Budget of each task in steps, of rollouts and of scenarios made from them; 0: the platform's."""
     frame_stride: int = 1
@@ -86,7 +86,7 @@ class CollectOptions:
         """
         if bool(self.policy) == bool(self.expert):
             raise OptionError(
-                "who drives? Give either --policy.path=CHECKPOINT or --expert NAME"
+                "give either --policy.path=CHECKPOINT or --expert NAME"
                 + (", not both" if self.policy else "")
             )
         self.workplace.check()

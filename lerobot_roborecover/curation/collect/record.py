@@ -32,9 +32,9 @@ class RecorderSettings:
     """How rollouts are recorded; plain values, so that they travel to a worker."""
 
     seed: int = 0
-    """Of the perturbation and of drivers that draw."""
+    """Of the perturbation and of controllers that draw."""
     expert: str = ""
-    """Name of the scripted driver; empty where a policy drives."""
+    """Name of the scripted controller; empty where a policy drives."""
     perturbed_steps: int = PERTURBED_STEPS
     """Leading interaction steps in which actions are perturbed."""
 

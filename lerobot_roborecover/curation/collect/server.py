@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from lerobot_roborecover.curation.collect.experts import make_driver
+from lerobot_roborecover.curation.collect.experts import make_controller
 from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator, pack_record
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.platforms import Observation, Simulator
@@ -122,11 +122,11 @@ class CollectServer(SlotServer):
             )
             return
         rng = stream(self._settings.seed, "driver", task, reset, planned.trial)
-        act = make_driver(self._settings.expert, simulator.inner, task, rng)
+        act = make_controller(self._settings.expert, simulator.inner, task, rng)
         for t in range(task.horizon):
             action = np.asarray(act(t), dtype=np.float64)
             if not np.isfinite(action).all():
-                yield RolloutResult(Outcome.POLICY_ERROR, t, f"the driver gave {action}")
+                yield RolloutResult(Outcome.POLICY_ERROR, t, f"the controller gave {action}")
                 return
             simulator.step(action)
             if simulator.over:

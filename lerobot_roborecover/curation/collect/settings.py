@@ -18,8 +18,8 @@ from lerobot_roborecover.utils.atomic_io import atomic_write
 SETTINGS_FILE = "collect.json"
 
 
-def driver_of(options: CollectOptions) -> str:
-    """Returns the recorded name of the driver."""
+def controller_of(options: CollectOptions) -> str:
+    """Returns the recorded name of the controller."""
     if options.name:
         return options.name
     if options.expert:
@@ -47,7 +47,7 @@ def settings_of(
     by_init_state = any(unit.reset.init_state_index is not None for unit in units)
     rolled = {
         "platform": options.platform,
-        "driver": driver_of(options),
+        "driver": controller_of(options),
         "policy": policy.policy if policy else "",
         "policy settings": dict(policy.policy_settings) if policy else {},
         "expert": options.expert,

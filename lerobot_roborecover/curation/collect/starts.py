@@ -23,7 +23,7 @@ class RolloutSpec(TrialStart):
     """A rollout to be made, from a task's first state: its prefix is nothing but the settling actions."""
 
     driver: str
-    """Recorded name of the driver."""
+    """Recorded name of the controller."""
     trial: int
     """Of the rollouts from this start."""
     perturbed: bool
@@ -83,7 +83,7 @@ def make_units(
     Args:
         tasks: tasks to collect on.
         starts: resets of each task.
-        driver: recorded name of the driver.
+        driver: recorded name of the controller.
         settle_action: (A,) repeated while settling.
         perturbed: whether actions are perturbed.
 

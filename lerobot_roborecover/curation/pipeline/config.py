@@ -36,7 +36,7 @@ class CollectPart:
     policy: str | None = None
     """Folder or Hub id of a checkpoint."""
     expert: str | None = None
-    """Or a scripted driver."""
+    """Or a scripted controller."""
     name: str | None = None
     task: list[str] = field(default_factory=list)
     seeds: str | int | None = None

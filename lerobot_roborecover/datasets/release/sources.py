@@ -1,4 +1,4 @@
-"""Who drove a rollout of the release, from the name that its record gives."""
+"""The controller of a rollout of the release, from the name that its record gives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lerobot_roborecover.scenario import ScenarioError, Source
 
 @dataclass(frozen=True)
 class Sources:
-    """Who drove, from the name that a record gives; the rules are those of `docs/publish.md`."""
+    """The controller, from the name that a record gives; the rules are those of `docs/publish.md`."""
 
     table: Mapping[str, tuple[Source, str]] = field(default_factory=dict)
     """Names that the rules get wrong: source and source policy by `model_name` or `policy_name`."""

@@ -19,7 +19,7 @@ ARMS = {
     "rollback:K": "K steps back, and the same policy with fresh history",
     "correction:CHECKPOINT": "a correction policy for some steps, then the same policy with fresh history",
     "policy:CHECKPOINT": "another policy",
-    "human:MODULE:FUNCTION": "a person, through a driver (docs/interventions.md)",
+    "human:MODULE:FUNCTION": "a person, through a controller (docs/interventions.md)",
 }
 """In the words of `--arm`."""
 MAX_BACK = 100_000
@@ -79,7 +79,7 @@ class ForkArm:
             correction=MemberConfig(self.value if self.kind == "correction" else ""),
             mode=self.kind,
             correction_steps=correction_steps,
-            driver=self.value if self.kind == "human" else "",
+            controller=self.value if self.kind == "human" else "",
             device=base.device,
         )
         config.check()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.platforms.base import Driver, Expert, Platform
+from lerobot_roborecover.platforms.base import Controller, Expert, Platform
 from lerobot_roborecover.platforms.controls import Controls
 from lerobot_roborecover.platforms.fake.simulator import FAKE_TASKS
 from lerobot_roborecover.scenario import Task
@@ -57,7 +57,7 @@ class FakePlatform(Platform):
 
 
 def _pusher(lag: float, about: str) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         """Goes around the puck and pushes it at the goal."""
         goal = np.array({"push-left": (-0.3, 0.0)}.get(task.name, (0.3, 0.0)))
         offset = rng.uniform(-lag, lag, 2)

@@ -1,4 +1,4 @@
-"""A scripted driver for gym_aloha's transfer task: the right arm picks the cube up and hands it over."""
+"""A scripted controller for gym_aloha's transfer task: the right arm picks the cube up and hands it over."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Transfer:
 
     Args:
         inner: gym_aloha's `AlohaEnv` of the transfer task, reset; it is read and never changed.
-        rng: draws where an imprecise driver believes the cube to be.
+        rng: draws where an imprecise controller believes the cube to be.
         error_m: how far off that is at most, along x and y.
     """
 

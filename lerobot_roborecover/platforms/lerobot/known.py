@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.platforms.base import Driver, Expert
+from lerobot_roborecover.platforms.base import Controller, Expert
 from lerobot_roborecover.scenario import Task
 
 
@@ -47,7 +47,7 @@ class EnvFacts:
 
 
 def _pusher(speed: float, error: float, about: str) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         from lerobot_roborecover.platforms.lerobot.pusht import Pusher
 
         return Pusher(simulator.env.unwrapped, rng, speed=speed, error=error)
@@ -56,7 +56,7 @@ def _pusher(speed: float, error: float, about: str) -> Expert:
 
 
 def _transfer(error_m: float, about: str) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         from lerobot_roborecover.platforms.lerobot.aloha import Transfer
 
         return Transfer(simulator.env.unwrapped, rng, error_m=error_m)

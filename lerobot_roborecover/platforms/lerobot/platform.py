@@ -69,7 +69,7 @@ class LeRobotPlatform(Platform):
 
     def unsupported_reason(self, task: Task) -> str:
         """Aloha's insertion has no script."""
-        return "its driver transfers the cube alone" if task.name == "AlohaInsertion-v0" else ""
+        return "its controller transfers the cube alone" if task.name == "AlohaInsertion-v0" else ""
 
     def make_simulator(self, **options: Any) -> Simulator:
         """See `Platform.make_simulator`; what is not given is the type's own.

@@ -1,4 +1,4 @@
-"""A scripted driver for PushT: tries pushes in a copy of the plane, and executes the one that helps most."""
+"""A scripted controller for PushT: tries pushes in a copy of the plane, and executes the best."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Pusher:
 
     Args:
         inner: the environment, reset.
-        rng: breaks ties between pushes that help as much, and draws what an imprecise driver gets wrong.
+        rng: breaks ties between pushes that help as much, and draws what an imprecise controller gets wrong.
         speed: of its pushes, in those that it plans with; above 1 the block slides further than planned.
         error: standard deviation of where it believes the block to be, pixels.
     """

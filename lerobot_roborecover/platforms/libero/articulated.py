@@ -1,4 +1,4 @@
-"""Scripted drivers for what turns or slides on a joint: drawers, a stove's knob, a microwave's door."""
+"""Scripted controllers for what turns or slides on a joint: drawers, a stove's knob, a microwave's door."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ hand that hangs down would meet those above."""
 
 
 class JointMotion(ClearMotion, ABC):
-    """A driver of one joint: approaches from `_standoff_m`, then works from `_contact_m`.
+    """A controller of one joint: approaches from `_standoff_m`, then works from `_contact_m`.
 
     Args:
         scene: of the simulator's current reset.

@@ -1,8 +1,8 @@
-"""The scripted driver of LIBERO's tasks, from privileged simulator state, with flaws to switch on.
+"""The scripted controller of LIBERO's tasks, from privileged simulator state, with flaws to switch on.
 
 Without flaws it is the expert that proves scenarios recoverable and makes demonstrations; with them it is a
-weaker driver whose failures are real rollouts. It takes up a task's goals one after the other, each with a
-driver of its kind, and tries again what has not worked or came undone.
+weaker controller whose failures are real rollouts. It takes up a task's goals one after the other, each with
+a controller of its kind, and tries again what has not worked or came undone.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class LiberoExpert:
         return self._motion.act()
 
     def _next(self) -> ArmMotion:
-        """The driver of the first goal that is not reached; of all that come together if it is to place."""
+        """Returns the controller of the first goal that is not reached."""
         scene, flaws = self._scene, self._flaws
         pending = [g for g in self._goals if not (scene.reached(g) or on_sill(scene, g))] or self._goals[-1:]
         first = pending[0]

@@ -9,7 +9,7 @@ GOAL_KINDS = ("on", "in", "open", "close", "turnon")
 PLACE_KINDS = ("on", "in")
 """Those about where an object is."""
 PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
-"""Predicates of a goal that the drivers know, and when their turn comes."""
+"""Predicates of a goal that the controllers know, and when their turn comes."""
 
 
 def turn_of(predicate: Sequence[str]) -> int:

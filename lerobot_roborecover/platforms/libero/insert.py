@@ -1,4 +1,4 @@
-"""A scripted driver for what belongs behind a door: brings it in from the front, the hand leaning in."""
+"""A scripted controller for what belongs behind a door: brings it in from the front, the hand leaning in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every scripted driver of LIBERO's arm is made of: flaws, phases, and commands towards a pose."""
+"""What every scripted controller of LIBERO's arm is made of: flaws, phases, and commands towards a pose."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STEP_M, _STEP_RAD = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Flaws:
-    """What is wrong with a weaker driver; all off for the expert."""
+    """What is wrong with a weaker controller; all off for the expert."""
 
     aim_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Constant error of the grasp, in the world."""
@@ -39,7 +39,7 @@ class Flaws:
 
 
 class ArmMotion:
-    """A driver of the arm in phases: `act` calls the method named after the phase.
+    """A controller of the arm in phases: `act` calls the method named after the phase.
 
     Args:
         scene: of the simulator's current reset.
@@ -66,7 +66,7 @@ class ArmMotion:
         self.phase, self._steps = phase, 0
 
     def _rest(self) -> np.ndarray:
-        """Waits, as a driver that believes it is done."""
+        """Waits, as a controller that believes it is done."""
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
 
     def _rotation_error(self) -> np.ndarray:
@@ -101,7 +101,7 @@ class ArmMotion:
 
 
 class ClearMotion(ArmMotion):
-    """A driver that begins with an empty hand above everything, and lets go at the end.
+    """A controller that begins with an empty hand above everything, and lets go at the end.
 
     Args:
         scene: of the simulator's current reset.
@@ -120,7 +120,7 @@ class ClearMotion(ArmMotion):
         return self._up(OPEN, 0.0 if self._steps < 6 else 0.06)
 
     def _end_or(self, again: Callable[[], None]) -> None:
-        """Rests after the one attempt of a driver that does not look, ends where the goal is reached, or
+        """Rests after the one attempt of a controller that does not look, ends where the goal is reached, or
         tries again."""
         if self._flaws.open_loop:
             self._enter("rest")

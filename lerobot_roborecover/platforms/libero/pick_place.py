@@ -1,4 +1,4 @@
-"""A scripted driver for `On` and `In` goals: picks an object up and places it, tries again."""
+"""A scripted controller for `On` and `In` goals: picks an object up and places it, tries again."""
 
 from __future__ import annotations
 
@@ -298,7 +298,7 @@ class PickPlace(ArmMotion):
         return np.array([float(np.clip(there[0] + side * _BESIDE_M, -0.068, 0.068)), 0.0])
 
     def _carried_xy(self) -> np.ndarray:
-        """What is brought over the goal: the object's body, or the hand of a driver that does not look."""
+        """Returns where the object is; open loop, where the hand is."""
         if self._flaws.open_loop:
             return self._scene.hand_m[:2]
         return self._scene.position_m(self.goal.item)[:2]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.platforms.base import Driver, Expert, Platform
+from lerobot_roborecover.platforms.base import Controller, Expert, Platform
 from lerobot_roborecover.platforms.controls import AXES, Controls
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.libero.assets import ASSETS_VARIABLE
@@ -71,14 +71,14 @@ class LiberoPlatform(Platform):
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
     def unsupported_reason(self, task: Task) -> str:
-        """The scripted drivers know all predicates of the four suites."""
+        """The scripted controllers know all predicates of the four suites."""
         from lerobot_roborecover.platforms.libero.catalog import libero_goal
         from lerobot_roborecover.platforms.libero.goals import PREDICATES
 
         unknown = [p for p in libero_goal(task.suite, task.name) if p[0] not in PREDICATES]
         if not unknown:
             return ""
-        return "no scripted driver knows " + ", ".join(" ".join(predicate) for predicate in unknown)
+        return "no scripted controller knows " + ", ".join(" ".join(predicate) for predicate in unknown)
 
     def short_name(self, task: Task) -> str:
         """With the suite: names occur in several."""
@@ -146,7 +146,7 @@ def _tasks() -> tuple[Task, ...]:
 
 
 def _scripted(flaws: Callable[[np.random.Generator], Mapping[str, Any]], about: str) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         from lerobot_roborecover.platforms.libero.expert import Flaws, LiberoExpert
         from lerobot_roborecover.platforms.libero.scene import LiberoScene
 
@@ -157,7 +157,7 @@ def _scripted(flaws: Callable[[np.random.Generator], Mapping[str, Any]], about: 
 
 
 def _drawn_flaw(rng: np.random.Generator) -> dict[str, Any]:
-    """One of the flaws of the starter set's drivers, which fit any pick-and-place task, and its size."""
+    """One of the flaws of the starter set's controllers, which fit any pick-and-place task, and its size."""
     angle, side = rng.uniform(0, 2 * np.pi), np.zeros(3)
     side[:2] = np.cos(angle), np.sin(angle)
     kinds = (

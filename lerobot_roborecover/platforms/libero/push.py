@@ -1,4 +1,4 @@
-"""A scripted driver for what is too wide to be grasped: slides a plate over the table by its rim."""
+"""A scripted controller for what is too wide to be grasped: slides a plate over the table by its rim."""
 
 from __future__ import annotations
 

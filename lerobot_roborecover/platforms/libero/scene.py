@@ -1,4 +1,4 @@
-"""What LIBERO's scripted driver knows: geometry, grasps and goals, from privileged simulator state."""
+"""What LIBERO's scripted controller knows: geometry, grasps and goals, from privileged simulator state."""
 
 from __future__ import annotations
 

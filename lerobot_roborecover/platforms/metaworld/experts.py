@@ -1,4 +1,4 @@
-"""Drivers for Meta-World: its own scripted policies, degraded and patient variants."""
+"""Controllers for Meta-World: its own scripted policies, degraded and patient variants."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
 from metaworld.policies.policy import Policy
 
-from lerobot_roborecover.platforms.base import Driver
+from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
 
 _REST_POSITION_M = np.array([0.0, 0.6, 0.25])
-"""Where the patient driver goes between attempts: above the middle of the table."""
+"""Where the patient controller goes between attempts: above the middle of the table."""
 _OBJECT_XY = slice(4, 6)
 """Horizontal position of the first object in Meta-World's observation."""
 
 
-def expert(simulator: MetaworldSimulator, task_name: str) -> Driver:
+def expert(simulator: MetaworldSimulator, task_name: str) -> Controller:
     """Meta-World's scripted policy of a task: memoryless, right about where everything is, and brittle.
 
     Its commands are proportional to the remaining error and leave [-1, 1]; they are clipped, as the simulator
@@ -38,7 +38,7 @@ def patient_expert(
     patience_steps: int = 130,
     back_off_steps: int = 45,
     jitter_m: float = 0.012,
-) -> Driver:
+) -> Controller:
     """The scripted policy with retries: proof that a state can be recovered where one attempt gets stuck.
 
     It opens the gripper, rises and returns to the middle, then attempts the task for `patience_steps`; from
@@ -73,7 +73,7 @@ def patient_expert(
     return act
 
 
-def biased_expert(simulator: MetaworldSimulator, task_name: str, rng: np.random.Generator) -> Driver:
+def biased_expert(simulator: MetaworldSimulator, task_name: str, rng: np.random.Generator) -> Controller:
     """The scripted policy with a camera out of calibration: it sees the object 1.5 to 4.5 cm off."""
     policy = ENV_POLICY_MAP[task_name]()
     angle, distance_m = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.015, 0.045)
@@ -87,7 +87,7 @@ def biased_expert(simulator: MetaworldSimulator, task_name: str, rng: np.random.
     return act
 
 
-def weak_grip_expert(simulator: MetaworldSimulator, task_name: str, rng: np.random.Generator) -> Driver:
+def weak_grip_expert(simulator: MetaworldSimulator, task_name: str, rng: np.random.Generator) -> Controller:
     """The scripted policy with a tired gripper: it closes with 3 to 30 % of the force, and things slip."""
     policy = ENV_POLICY_MAP[task_name]()
     strength = rng.uniform(0.03, 0.3)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.platforms.base import Driver, Expert, Platform
+from lerobot_roborecover.platforms.base import Controller, Expert, Platform
 from lerobot_roborecover.platforms.controls import Controls
 from lerobot_roborecover.scenario import Task
 
@@ -73,7 +73,7 @@ def _tasks() -> tuple[Task, ...]:
 
 
 def _own(function: str, about: str) -> Expert:
-    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Driver:
+    def make(simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
         from lerobot_roborecover.platforms.metaworld import experts
 
         if function == "expert":

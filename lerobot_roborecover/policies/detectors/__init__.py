@@ -1,4 +1,4 @@
-"""Detectors: what says, step by step, whether the acting policy needs help. Monitors are detectors; so are
+"""Detectors score, step by step, whether the acting policy will fail. Monitors are detectors; so are
 LeRobot's own reward models, and what needs no training.
 
 Light: importing this package imports neither LeRobot nor torch.

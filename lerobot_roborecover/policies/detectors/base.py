@@ -31,7 +31,7 @@ class DetectorConfig(RewardModelConfig):
 
     device: str | None = "cpu"
     threshold: float | None = None
-    """Score above which it asks for help; `roborecover detect evaluate` sets it. None never asks."""
+    """Score above which it alarms; `roborecover detect evaluate` sets it. None never alarms."""
     max_batch: int = 256
     """Windows judged at once."""
     policy: str = ""

@@ -66,6 +66,6 @@ class RoboRecoverRecoveryGainConfig(FeatureNetworkConfig):
     """Gain of an intervention now, P(success | intervene) - P(success | continue), fitted to forks."""
 
     threshold: float | None = 0.0
-    """Gain above which it asks for help; `roborecover detect evaluate` never sets less than 0."""
+    """Gain above which it alarms; `roborecover detect evaluate` never sets less than 0."""
     arm: str = ""
     """Of the forks that it is fitted to, or how that begins (`correction`); empty where they have one."""

@@ -14,7 +14,7 @@ TRUTHS = ("recovery_point", "outcome")
 @RewardModelConfig.register_subclass("roborecover_constant")
 @dataclass
 class RoboRecoverConstantConfig(DetectorConfig):
-    """Asks for help at a constant rate, whatever it sees: what any detector must beat."""
+    """Alarms at a constant rate, whatever it sees: what any detector must beat."""
 
     rate: float = 0.01
     """Chance at each step, from 0 to 1."""

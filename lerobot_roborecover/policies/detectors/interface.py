@@ -99,7 +99,7 @@ class DetectorWindow:
 
 @runtime_checkable
 class Detector(Protocol):
-    """Says of each window how much help is needed."""
+    """Scores windows: a higher score means that failure is more likely."""
 
     @property
     def needs(self) -> DetectorNeeds:
@@ -110,7 +110,7 @@ class Detector(Protocol):
         """Windows that it can judge at once."""
 
     def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
-        """Scores, and whether each asks for help at the detector's own threshold; never where it has none."""
+        """Returns scores, and alarms at the detector's own threshold; none without a threshold."""
 
 
 class MonitorDetector:

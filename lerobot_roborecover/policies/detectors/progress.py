@@ -1,6 +1,6 @@
 """LeRobot's own reward models as detectors: `sarm`, `robometer`, `topreward`.
 
-Their reward says how far the task has come. Help is needed where it falls back: the score is the reward of
+Their reward says how far the task has come. A failure is likely where it falls: the score is the reward of
 `lag` steps ago less that of now; with `lag=0` it is the reward itself, turned round. Each is given the frames
 that it was made for, from the history: one every `stride` steps up to now, or, for `sarm`, its own deltas,
 those after now replaced by now.
@@ -44,7 +44,7 @@ class ProgressOptions:
     stride: int = 4
     """Steps between the frames that it is given; SARM has its own."""
     threshold: float | None = None
-    """Score above which it asks for help; None never asks."""
+    """Score above which it alarms; None never alarms."""
     max_batch: int = 8
     """Windows judged at once."""
 

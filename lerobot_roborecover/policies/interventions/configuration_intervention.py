@@ -11,6 +11,7 @@ from lerobot.optim.optimizers import OptimizerConfig
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.interventions.options import MODES, POLICY_TYPE
 from lerobot_roborecover.policies.not_trained import NotTrained
+from lerobot_roborecover.utils.renamed_fields import move_old_fields
 
 
 @dataclass
@@ -60,15 +61,22 @@ class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
     rewind_steps: int | None = None
     """Steps that a rollback goes back, never beyond the task's start. Default: the paper's, 30, and on
     RoboTwin 60 for tasks with a horizon of 500 or more."""
-    driver: str = ""
-    """Who stands in for `human`: `package.module:function`, which returns an
-    `policies.interventions.takeover.Driver`."""
+    controller: str = ""
+    """Of mode `human`: `package.module:function`, which returns a
+    `policies.interventions.takeover.TakeoverController`."""
+    driver: str | None = None
+    """Earlier name of `controller`."""
     push_to_hub: bool = False
 
     counted_elsewhere: ClassVar[tuple[str, ...]] = (
-        "base", "correction", "monitor", "mode", "correction_steps", "rewind_steps", "driver",
+        "base", "correction", "monitor", "mode", "correction_steps", "rewind_steps", "controller",
+        "driver",
     )  # fmt: skip
     """Fields that `policies.metadata.intervention_facts` says by content, in `TrialRow.options`."""
+
+    def __post_init__(self) -> None:
+        move_old_fields(self, "--policy.", {"driver": "controller"})
+        super().__post_init__()
 
     def check(self) -> None:
         """Refuses what cannot be used; not while parsing, where draccus would bury the message.
@@ -92,9 +100,10 @@ class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
             )
         if self.rewind_steps is not None and not 1 <= self.rewind_steps <= 100_000:
             raise OptionError(f"--policy.rewind_steps={self.rewind_steps}: a step count from 1 to 100000")
-        if self.mode == "human" and not self.driver:
+        if self.mode == "human" and not self.controller:
             raise OptionError(
-                "--policy.mode=human needs --policy.driver=package.module:function, which returns the driver"
+                "--policy.mode=human needs --policy.controller=package.module:function, which returns the "
+                "controller"
             )
 
     @property

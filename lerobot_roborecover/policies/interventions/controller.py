@@ -28,7 +28,7 @@ from lerobot_roborecover.policies.detectors.monitor_interface import Monitor
 from lerobot_roborecover.policies.detectors.online import OnlineDetector
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.interventions.members import MemberHost
-from lerobot_roborecover.policies.interventions.takeover import Driver
+from lerobot_roborecover.policies.interventions.takeover import TakeoverController
 from lerobot_roborecover.policies.runner import Chunk, PolicyError
 from lerobot_roborecover.workers.control_columns import BY_RULE, ControlColumns, Controller, append_columns
 
@@ -66,7 +66,7 @@ class InterventionController:
         mode: of the composite policy.
         monitor: a monitor or any other detector, which decides when; None intervenes at the recovery point.
         probe: into the base policy, for a detector that looks into it.
-        driver: the person, for mode `human`.
+        takeover: the person, for mode `human`.
         correction_steps: of the correction policy.
         rewind_steps: of a rollback; None follows the paper's rule.
     """
@@ -78,12 +78,12 @@ class InterventionController:
         *,
         monitor: Monitor | Detector | None = None,
         probe: PolicyProbe | None = None,
-        driver: Driver | None = None,
+        takeover: TakeoverController | None = None,
         correction_steps: int = 30,
         rewind_steps: int | None = None,
     ):
         self.members = dict(members)
-        self._mode, self._driver = mode, driver
+        self._mode, self._takeover = mode, takeover
         self._watcher = None if monitor is None else OnlineDetector(as_detector(monitor), probe)
         self._correction_steps = correction_steps
         self._rollback = BY_RULE if rewind_steps is None else rewind_steps
@@ -122,7 +122,7 @@ class InterventionController:
         """
         out: list[Chunk | PolicyError | None] = [None] * len(episodes)
         self._watch(observations, instructions, episodes, out)
-        # A driver that hands its slot back is followed by the base policy in the same step.
+        # A controller that hands its slot back is followed by the base policy in the same step.
         for controller in (Controller.HUMAN, Controller.CORRECTION, Controller.BASE):
             due = [
                 i
@@ -223,10 +223,10 @@ class InterventionController:
             episode.history = self.members[controller].start(None)
             episode.history.stream = episode.stream
 
-    def _person(self) -> Driver:
-        if self._driver is None:
-            raise RuntimeError(f"mode {self._mode} needs a driver")
-        return self._driver
+    def _person(self) -> TakeoverController:
+        if self._takeover is None:
+            raise RuntimeError(f"mode {self._mode} needs a controller")
+        return self._takeover
 
     def _driven(
         self, observation: Observation, instruction: str, episode: InterventionState
@@ -242,7 +242,9 @@ class InterventionController:
             return None
         action = np.asarray(action)
         if action.shape != (self._width,) or not np.issubdtype(action.dtype, np.floating):
-            return PolicyError(f"the driver gave {action.dtype} {action.shape}, not floats ({self._width},)")
+            return PolicyError(
+                f"the person's action is {action.dtype} {action.shape}, not floats ({self._width},)"
+            )
         return action[None]
 
     def _next(self, episode: InterventionState) -> Chunk:

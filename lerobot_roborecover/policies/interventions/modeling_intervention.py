@@ -25,7 +25,7 @@ from lerobot_roborecover.policies.interventions.controller import InterventionCo
 from lerobot_roborecover.policies.interventions.host import InterventionHost, tensors
 from lerobot_roborecover.policies.interventions.members import MemberHost, load_member
 from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
-from lerobot_roborecover.policies.interventions.takeover import load_driver
+from lerobot_roborecover.policies.interventions.takeover import load_controller
 from lerobot_roborecover.policies.runner import PolicyError, Processor
 from lerobot_roborecover.workers.control_columns import Controller
 
@@ -66,7 +66,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
             config.mode,
             monitor=monitor,
             probe=probe,
-            driver=load_driver(config.driver) if config.mode == "human" else None,
+            takeover=load_controller(config.controller) if config.mode == "human" else None,
             correction_steps=config.correction_steps,
             rewind_steps=config.rewind_steps,
         )

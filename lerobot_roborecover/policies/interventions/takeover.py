@@ -1,8 +1,8 @@
-"""Human takeover: what stands between the composite policy and a person, or whatever drives in their place.
+"""Human takeover: the interface between the composite policy and a person, or a script in their place.
 
-`--policy.mode=human --policy.driver=package.module:function` calls `function()` once; what it returns drives
-every slot that is handed over, one action at a time, until it says that it is done. Then, or when the trial
-ends, the slot is the base policy's again, with fresh history.
+`--policy.mode=human --policy.controller=package.module:function` calls `function()` once. What it returns
+controls every slot that is handed over, one action at a time, until it hands the slot back. Then, or when the
+trial ends, the base policy continues with fresh history.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 @runtime_checkable
-class Driver(Protocol):
-    """Drives slots. A call may take as long as a person needs: only this trial's simulator waits for it, and
+class TakeoverController(Protocol):
+    """Controls slots. A call may take as long as a person needs: only this trial's simulator waits, and
     those that are due for the policy."""
 
     def take(self, instruction: str) -> Any:
@@ -48,17 +48,17 @@ _MOVED = dict.fromkeys(
     ("lerobot_roborecover.build.teleop.takeover", "lerobot_roborecover.studio.teleop.takeover"),
     "lerobot_roborecover.web.teleop.takeover",
 )
-"""Drivers under the names that they once had, which saved configurations may hold."""
+"""Controllers under the names that they once had, which saved configurations may hold."""
 
 
-def load_driver(name: str) -> Driver:
-    """The driver that an option names.
+def load_controller(name: str) -> TakeoverController:
+    """The controller that an option names.
 
     Args:
         name: `package.module:function`.
 
     Raises:
-        OptionError: there is no such function, or what it returns is no driver.
+        OptionError: there is no such function, or what it returns is no controller.
     """
     module_name, _, function = name.partition(":")
     module_name = _MOVED.get(module_name, module_name)
@@ -66,12 +66,12 @@ def load_driver(name: str) -> Driver:
         made = getattr(importlib.import_module(module_name), function)()
     except (ImportError, AttributeError, ValueError) as err:
         raise OptionError(
-            f"--policy.driver={name}: cannot be made ({err}). Give package.module:function, importable from "
-            "where this runs"
+            f"--policy.controller={name}: cannot be made ({err}). Give package.module:function, "
+            "importable from where this runs"
         ) from err
-    if not isinstance(made, Driver):
+    if not isinstance(made, TakeoverController):
         raise OptionError(
-            f"--policy.driver={name}: gave a {type(made).__name__}, which lacks `take`, `act` or `leave` "
+            f"--policy.controller={name}: gave a {type(made).__name__}, which lacks `take`, `act` or `leave` "
             "(lerobot_roborecover.policies.interventions.takeover)"
         )
     return made

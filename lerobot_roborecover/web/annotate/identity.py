@@ -1,8 +1,8 @@
 """Which dataset and which episode a vote is about, in words that tell an annotator nothing.
 
-Candidates' ids say who drove and what was perturbed, and a folder's name often does, too. What annotators
-see, in the page, its address, the browser's storage and on the wire, are hashes: the same at every start,
-mapped back here.
+Candidates' ids name the controller and what was perturbed, and a folder's name often does, too. What
+annotators see, in the page, its address, the browser's storage and on the wire, are hashes: the same at every
+start, mapped back here.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
         for name in names:
             done = len(set(annotators[name].book.ballot().votes) & wanted)
             say(f"{name}: {done} of {len(wanted)} done  http://{HOST}:{port}/{name}/?token={tokens[name]}")
-        say(f"the page calls this dataset {called.dataset}: its name might say who drove")
+        say(f"the page calls this dataset {called.dataset}: its name might tell the controller")
         say(f"votes are kept in {folder}; Ctrl-C stops, the same command goes on")
         make_server(app).run(sockets=[listener])
     finally:

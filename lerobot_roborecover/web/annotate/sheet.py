@@ -1,6 +1,6 @@
 """What the page is told of an episode: all that may be shown, in words for people.
 
-Not who drove, nor what others marked, nor the candidate's own id (`identity.py`).
+Not the controller, nor what others marked, nor the candidate's own id (`identity.py`).
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class TeleopRefusal(ScenarioError):
 
 
 class Client:
-    """One driver, one thing at a time.
+    """One controller, one thing at a time.
 
     Args:
         address: as `roborecover curate teleop` prints it, with the token.

@@ -77,7 +77,7 @@ class Hub:
         return any(v.pictures for v in list(self.viewers))
 
     def unseen(self, taken: int) -> int:
-        """Returns how many steps the driver has not seen yet; 0 for a driver that receives no images.
+        """Returns how many steps the controller has not seen yet; 0 for a controller that receives no images.
 
         Args:
             taken: steps over the whole session.
@@ -100,7 +100,7 @@ class Hub:
     # --- the server's
 
     def join(self, pictures: bool) -> Viewer | None:
-        """Adds a viewer, which drives if there is no driver. None where there are too many viewers."""
+        """Adds a viewer, which drives if there is no controller. None where there are too many viewers."""
         self._loop = asyncio.get_running_loop()
         if len(self.viewers) >= MAX_VIEWERS:
             return None
@@ -121,7 +121,7 @@ class Hub:
             self._everybody()
 
     def drive(self, viewer: Viewer) -> None:
-        """Makes a viewer the driver."""
+        """Makes a viewer the controller."""
         self.driver = viewer
         self._everybody()
 

@@ -36,7 +36,7 @@ def steps_per_picture(rate_hz: float, fps: float) -> int:
 
 
 def most_unseen(rate_hz: float, fps: float) -> int:
-    """Returns how many steps the driver may not have seen yet: those of two images, because one is on the
+    """Returns how many steps the controller may not have seen yet: those of two images, because one is on the
     screen and the next is on its way."""
     return 2 * steps_per_picture(rate_hz, fps)
 

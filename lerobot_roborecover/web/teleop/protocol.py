@@ -23,7 +23,7 @@ COMMANDS = (
     "start", "preview", "act", "back", "mark", "relabel", "unmark", "finish", "discard", "gripper",
     "realtime", "status", "hand_back",
 )  # fmt: skip
-"""Commands; each is answered, and only accepted from the driver."""
+"""Commands; each is answered, and only accepted from the controller."""
 _HEADER = struct.Struct("<BxxxI")
 
 

@@ -29,7 +29,7 @@ class TeleopConfig:
     """The candidate dataset; new, or one that an earlier session made."""
     platform: str
     operator: str
-    """A plain name or pseudonym; becomes the recordings' driver."""
+    """A plain name or pseudonym; becomes the recordings' controller."""
     starts: Sequence[StartPoint] = ()
     port: int = DEFAULT_PORT
     """0 takes a free one."""

@@ -45,7 +45,7 @@ class TeleopSession:
 
     Args:
         simulator: owned by the caller; used from one thread.
-        operator: who drives; becomes the recording's driver.
+        operator: name; becomes the recording's controller.
     """
 
     def __init__(self, simulator: Simulator, operator: str):

@@ -49,7 +49,7 @@ class SimulatorThread(threading.Thread):
 
     Args:
         make_simulator: called in this thread, which alone uses what it returns.
-        operator: who drives.
+        operator: name.
         starts: where to begin, in order.
         store: takes what is saved.
         hub: the viewers.

@@ -1,5 +1,5 @@
 """A person at the page as the interventions' driver: `--policy.mode=human
---policy.driver=lerobot_roborecover.web.teleop.takeover:driver`.
+--policy.controller=lerobot_roborecover.web.teleop.takeover:controller`.
 
 The page shows what the policy sees, the person drives one step at a time until they hand back. Here the
 evaluation waits for the person, so that its own thread asks the pilot; there is no simulator of ours.
@@ -45,7 +45,7 @@ class TakeoverSlot:
 
 
 class Takeover:
-    """An `policies.interventions.takeover.Driver`.
+    """An `policies.interventions.takeover.TakeoverController`.
 
     Args:
         port: of the page; 0 takes a free one.
@@ -74,7 +74,7 @@ class Takeover:
         print(f"takeovers are driven at {self.address}", file=sys.stderr, flush=True)
 
     def take(self, instruction: str) -> TakeoverSlot:
-        """See `Driver.take`.
+        """See `TakeoverController.take`.
 
         Raises:
             OptionError: another slot is being driven.
@@ -89,7 +89,7 @@ class Takeover:
         return self._slot
 
     def act(self, slot: TakeoverSlot, observation: Mapping[str, torch.Tensor]) -> np.ndarray | None:
-        """See `Driver.act`; waits for the person."""
+        """See `TakeoverController.act`; waits for the person."""
         if slot.controls is None:
             self._begin(slot, observation)
         assert slot.controls is not None
@@ -110,7 +110,7 @@ class Takeover:
                 return None
 
     def leave(self, slot: TakeoverSlot) -> None:
-        """See `Driver.leave`."""
+        """See `TakeoverController.leave`."""
         self._slot = None
         self._pilot.let_go()
         self._publish()
@@ -172,8 +172,8 @@ class Takeover:
         return status
 
 
-def driver() -> Takeover:
-    """What `--policy.driver` names.
+def controller() -> Takeover:
+    """What `--policy.controller` names.
 
     Raises:
         OptionError: the port is no number.
@@ -204,3 +204,7 @@ def _pictures(observation: Mapping[str, torch.Tensor]) -> dict[str, bytes]:
     found = {k: v for k, v in observation.items() if k.startswith(_IMAGES) and v.ndim == 3}
     arrays = {k: np.rint(v.detach().cpu().numpy().transpose(1, 2, 0) * 255) for k, v in found.items()}
     return {k: encode(a.clip(0, 255).astype(np.uint8)) for k, a in arrays.items()}
+
+
+driver = controller
+"""The function's earlier name, which configurations may hold."""
