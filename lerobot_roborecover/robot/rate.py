@@ -70,7 +70,7 @@ def rate_all(run: Path, rater: str, seed: int, console: Console, say: Callable[[
         raise ScenarioError(
             f"--rater {rater!r:.40} gave this run's first verdicts; a second rater is another"
         )
-    films = Episodes(run / f"rollout_{run.name}")
+    episodes = Episodes(run / f"rollout_{run.name}")
     with Journal(run / FOLDER / f"{check_name(rater)}.jsonl", SCHEMA) as journal:
         done = {record["episode"] for record in journal.records}
         order = np.random.default_rng([seed, len(rater)]).permutation(len(rows))
@@ -78,13 +78,13 @@ def rate_all(run: Path, rater: str, seed: int, console: Console, say: Callable[[
             trial = RobotTrial.of_json(rows[index].robot or {})
             if trial.episode is None or trial.episode in done:
                 continue
-            film = _Film(console, films, trial.episode)
+            video = _Video(console, episodes, trial.episode)
             said = console.ask(
                 "rate",
                 f"{len(done)} of {len(rows)} rated. Is the task done at the end?",
                 ("success", "failure", "pause"),
                 {"instruction": rows[index].instruction},
-                meanwhile=film.go_on,
+                meanwhile=video.go_on,
             )
             if said.button == "pause":
                 break
@@ -95,14 +95,14 @@ def rate_all(run: Path, rater: str, seed: int, console: Console, say: Callable[[
     return len(done)
 
 
-class _Film:
+class _Video:
     """Shows a trial's frames in turn, over and over."""
 
-    def __init__(self, console: Console, films: Any, episode: int):
-        steps = films.steps(episode)
+    def __init__(self, console: Console, episodes: Any, episode: int):
+        steps = episodes.steps(episode)
         frames = sorted({round(f) for f in np.linspace(0, steps - 1, min(FRAMES, steps))})
         self._console, self._begun = console, time.monotonic()
-        self._pictures = films.pictures(episode, frames)
+        self._pictures = episodes.pictures(episode, frames)
         self._count = len(frames)
         self.go_on()
 
