@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Reset, Scenario, Task
 from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
@@ -104,13 +104,16 @@ def run_engine(
                 each.send("reset", EpisodeSpec(loaded[number % len(loaded)], "recovery", 0, False))
             for each in pool:
                 assert not isinstance(reply := each.receive(), SlotFailure), reply
+            units = units_of(list(loaded), trials)
+            engine = open_engine(
+                run, units, lambda: host, EngineConfig(slots=slots), on_row=lambda row: rows.append(row.steps)
+            )
             if observe is not None:
                 for number, each in enumerate(pool):
                     watch(each, number, observe)
-            engine = LocalEngine(run, host, slots=slots, on_row=lambda row: rows.append(row.steps))
             cpu = time.process_time(), sum(process_cpu_s(each.pid) for each in pool)
             began = time.perf_counter()
-            engine.run(units_of(list(loaded), trials))
+            engine.run(units)
             seconds = time.perf_counter() - began
             if spent is not None:
                 own, simulators = time.process_time(), sum(process_cpu_s(each.pid) for each in pool)

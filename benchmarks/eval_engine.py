@@ -36,10 +36,10 @@ from engine_parts import (
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.replay.handoff import hand_off
@@ -211,7 +211,9 @@ def startup_one(args: argparse.Namespace) -> dict:
         )
         host = StubHost(7)
         run.pool.acquire()
-        LocalEngine(run, host, slots=2).run(units_of(list(loaded), 1), host.started.is_set)
+        run_work_items(
+            run, units_of(list(loaded), 1), lambda: host, EngineConfig(slots=2), stop=host.started.is_set
+        )
         run.pool.release()
     return {}
 

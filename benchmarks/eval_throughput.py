@@ -28,8 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from scipy import stats
 
-from lerobot_roborecover.evaluation.scheduler import Engine, units_of
+from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.row import EvalProtocol
 from lerobot_roborecover.policies.runner import InlineReplica
 from tests.support.factories import fake_scenario

@@ -6,22 +6,23 @@ be replayed: for the monitor's frames, or as a demonstration. A rerun goes on wh
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
-from lerobot_roborecover.evaluation.scheduler import units_of
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
+from lerobot_roborecover.evaluation.work_items import unfinished, units_of
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions, read_actions
 from lerobot_roborecover.logs.policy_settings import digest_of
-from lerobot_roborecover.logs.row import TrialRow, trial_key
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.metadata import policy_metadata
@@ -94,36 +95,25 @@ def run_trials(
     config = loading.policy_config(policy, policy_options, device)
     facts = policy_metadata(config, rename_map=rename_map, n_episodes=trials)
     env.trial_log = str(folder / TRIALS_FILE)
-    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts)
-    log = run.require_log()
-    run.protocol = replace(run.protocol, run_seed=seed)
-    chosen = [s for s in scenarios if only is None or s.id in only]
-    units = units_of(sorted(chosen, key=lambda s: s.id), trials)
-    hash_ = run.protocol.config_hash()
-    keys = [trial_key(u.scenario.sha256(), u.scenario.id, hash_, u.trial) for u in units]
-    atomic_write(folder / CURRENT_FILE, json.dumps({"config_hash": hash_}) + "\n")
-    run.pool.acquire()
-    try:
-        todo = [u for u, key in zip(units, keys, strict=True) if log.find(key) is None]
-        if todo:
-            spec = loading.HostSpec(config, env, rename_map or {}, seed, max_batch)
-            places = EngineConfig(
-                workplace, slots, replicas, str(config.device), env.obs_type != "state",
-                snapshot_dir=env.snapshot_dir or None,
-            )  # fmt: skip
-            run.on_trial_end = partial(_keep_actions, folder / ACTIONS_FOLDER)
-            count = [len(units) - len(todo)]
-
-            def told(row: TrialRow) -> None:
-                count[0] += 1
-                on_row(row, count[0], len(units))
-
-            engine = open_engine(run, todo, partial(loading.load_host, spec), places, on_row=told)
-            engine.run(todo)
-            engine.check_all_run()
-        rows = {r.key(): r for r in log.rows}
-    finally:
-        run.pool.release()
+    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts, run_seed=seed)
+    run.on_trial_end = partial(_keep_actions, folder / ACTIONS_FOLDER)
+    spec = loading.HostSpec(config, env, rename_map or {}, seed, max_batch)
+    places = EngineConfig(
+        workplace, slots, replicas, str(config.device), env.obs_type != "state",
+        snapshot_dir=env.snapshot_dir or None,
+    )  # fmt: skip
+    with run:
+        chosen = [s for s in scenarios if only is None or s.id in only]
+        units = units_of(sorted(chosen, key=lambda s: s.id), trials)
+        keys = run.keys([(u.scenario, u.trial) for u in units])
+        current = {"config_hash": run.protocol.config_hash()}
+        atomic_write(folder / CURRENT_FILE, json.dumps(current) + "\n")
+        done = itertools.count(len(units) - len(unfinished(run, units)) + 1)
+        run_work_items(
+            run, units, partial(loading.load_host, spec), places,
+            on_row=lambda row: on_row(row, next(done), len(units)),
+        ).check_all_run()  # fmt: skip
+        rows = {r.key(): r for r in run.require_log().rows}
     return [_with_actions(rows[key], folder / ACTIONS_FOLDER) for key in keys if key in rows]
 
 

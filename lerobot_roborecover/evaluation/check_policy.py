@@ -34,7 +34,6 @@ from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scen
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
-from lerobot_roborecover.evaluation.sizes import default_slots
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.load_problems import load_remedy
@@ -43,7 +42,7 @@ from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner, WatchedHost
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.temporary import TemporaryFolder
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
 from lerobot_roborecover.workers.messages import EpisodeStart
 
 SHORT = {"--json": "--check.json=true"}

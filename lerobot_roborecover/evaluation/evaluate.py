@@ -12,7 +12,7 @@ import random
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,12 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig, env_type
-from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.loading import HostSpec, load_host, load_processors, policy_config
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.callables import (
@@ -128,11 +128,10 @@ def evaluate(
             )  # fmt: skip
             make_host = partial(_host, spec, policy, *own) if own else partial(load_host, spec)
             device = str(config.device)
-        chosen, run = create_session(options, options.run_spec(), workers=True, facts=facts, scenarios=chosen)
-        run.protocol = replace(run.protocol, run_seed=seed)
-        run.pool.acquire()
-        try:
-            units = units_of(sorted(chosen, key=lambda s: s.id), trials)
+        chosen, run = create_session(
+            options, options.run_spec(), workers=True, facts=facts, scenarios=chosen, run_seed=seed
+        )
+        with run:
             tally = RunProgress(run.protocol.start, chosen.ids, trials)
             tally.add([asdict(r) for r in run.rows()])
             line = ProgressLine(run.protocol.start, detailed=True) if progress else None
@@ -142,20 +141,15 @@ def evaluate(
                 if line is not None:
                     line.show(tally)
 
-            if tally.done < tally.total:
-                places = EngineConfig(slots=slots, device=device, draws=options.obs_type != "state")
-                engine = open_engine(run, units, make_host, places, on_row=show)
-                engine.run(units)
-                for (scenario, trial), reason in list(engine.unrun.items())[:1]:
-                    logger.warning(
-                        "%s could not be run, and have no row: trial %d of %s: %s",
-                        pluralize(len(engine.unrun), "trial"), trial, scenario, reason,
-                    )  # fmt: skip
+            units = units_of(sorted(chosen, key=lambda s: s.id), trials)
+            places = EngineConfig(slots=slots, device=device, draws=options.obs_type != "state")
+            result = run_work_items(run, units, make_host, places, on_row=show)
+            if result.unrun:
+                count = pluralize(len(result.unrun), "trial")
+                logger.warning("%s could not be run, and have no row: %s", count, result.problem)
             if line is not None:
                 line.show(tally, final=True)
             found = {(r.scenario_id, r.trial): r for r in run.rows()}
-        finally:
-            run.pool.release()
     return [found[s.id, k] for s in chosen for k in range(trials) if (s.id, k) in found]
 
 

@@ -1,21 +1,29 @@
-"""Opens an engine where it is wanted, on this machine or on a Ray cluster: for all that runs policies."""
+"""Runs work items: the one way from a session to rows, for evaluation, screening, collecting and forks.
+
+`run_work_items` leaves out what the trial log already holds, starts simulators and the policy on this machine
+or on a Ray cluster, and runs the trials. Each caller says which work items, which policy, and what to do with
+each finished trial.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from multiprocessing.connection import wait
 from typing import Any
 
-from lerobot_roborecover.evaluation.local_engine import open_local_engine
 from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.sizes import default_slots
-from lerobot_roborecover.evaluation.smoke import check_smoke
-from lerobot_roborecover.evaluation.work_items import WorkItem, first_units
-from lerobot_roborecover.policies.runner import PolicyRunner
+from lerobot_roborecover.evaluation.work_items import WorkItem, first_units, unfinished
+from lerobot_roborecover.platforms import SimulatorError
+from lerobot_roborecover.policies.policy_thread import CallStoppedError, PolicyThread
+from lerobot_roborecover.policies.runner import InlineReplica, PolicyRunner
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.backend import LOCAL, Backend, WorkerStartup
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
+from lerobot_roborecover.workers.messages import SlotFailure
 from lerobot_roborecover.workers.render_device import egl_devices, node_drawing, render_environment
 
 
@@ -38,11 +46,79 @@ class EngineConfig:
     """On a cluster: folder of handoff snapshots that all nodes share."""
 
 
+@dataclass(frozen=True)
+class RunResult:
+    """What a run of work items came to; the rows are in the trial log."""
+
+    finished: int = 0
+    """Trials that ended in this run."""
+    reruns: int = 0
+    """Trials that were restarted because a machine, the policy, or the connection to it was lost."""
+    unrun: Mapping[tuple[str, int], str] = field(default_factory=dict)
+    """Why trials were left for another run, by scenario and trial: the policy could not be reached, or an
+    inference never ended."""
+
+    @property
+    def problem(self) -> str:
+        """The trials that were left and why, as a sentence's end; empty where none was."""
+        if not self.unrun:
+            return ""
+        (scenario, trial), reason = next(iter(self.unrun.items()))
+        return f"trial {trial} of {scenario}: {reason}"
+
+    def check_all_run(self) -> None:
+        """Checks that no trial was left for another run.
+
+        Raises:
+            ScenarioError: some were; the same command goes on.
+        """
+        if self.unrun:
+            raise ScenarioError(
+                f"{pluralize(len(self.unrun), 'trial')} could not be run: the policy was away or hung "
+                f"({self.problem}). What has finished is kept: once the policy answers, run the same command "
+                "again"
+            )
+
+
+def run_work_items(
+    run: EvalSession,
+    items: Sequence[WorkItem],
+    make_host: Callable[[], PolicyRunner],
+    config: EngineConfig,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> RunResult:
+    """Runs the work items that the session's trial log does not hold yet; without any, nothing is started.
+
+    Args:
+        run: pool, protocol, trial log.
+        items: trials to run.
+        make_host: loads the policy. For a cluster it must travel: a module's function, or a partial of one.
+        config: where, and how many at once.
+        stop: asked between events; True starts no new trial and drops the running ones.
+        options: of `Engine`, such as `on_row`, which is called with every finished trial's row.
+
+    Raises:
+        OptionError: a cluster is not there, or lacks what is asked for.
+        SimulatorError: no simulator can be made.
+    """
+    todo = unfinished(run, items)
+    if not todo:
+        return RunResult()
+    try:
+        engine = open_engine(run, todo, make_host, config, stop=stop, **options)
+    except CallStoppedError:  # before the policy was loaded
+        return RunResult()
+    finished = engine.run(todo, stop)
+    return RunResult(finished, engine.reruns, engine.unrun)
+
+
 def open_engine(
     run: EvalSession,
     units: Sequence[WorkItem],
     make_host: Callable[[], PolicyRunner],
-    places: EngineConfig,
+    config: EngineConfig,
     *,
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
@@ -53,8 +129,8 @@ def open_engine(
     Args:
         run: pool, protocol, trial log.
         units: what will be run; not empty.
-        make_host: loads the policy. For a cluster it must travel: a module's function, or a partial of one.
-        places: where.
+        make_host: loads the policy, as for `run_work_items`.
+        config: where.
         stop: asked while a policy loads on this machine; True gives up.
         options: of `Engine`.
 
@@ -63,29 +139,70 @@ def open_engine(
         OptionError: a cluster is not there, or lacks what is asked for.
         SimulatorError: no simulator can be made.
     """
-    workplace, units = places.workplace, list(units)
-    if not workplace.on_cluster:
-        drawing = None
-        if places.draws:
-            drawing = render_environment(places.render_device, places.device, egl_devices())
-        slots = places.slots or default_slots(places.device, usable_cores(), available_gb())
-        return open_local_engine(run, units, make_host, slots, drawing, stop=stop, **options)
+    if not config.workplace.on_cluster:
+        return _open_local_engine(run, units, make_host, config, stop, options)
     from lerobot_roborecover.evaluation.ray_engine import open_ray_engine
 
-    startup = WorkerStartup(first=("fingerprint", None), check=check_smoke)
-    if places.draws:
+    startup = WorkerStartup(first=("fingerprint", None), check=check_first_reply)
+    if config.draws:
         (first,) = first_units(units, 1)
-        drawing = partial(node_drawing, places.render_device)
-        startup = WorkerStartup(drawing, ("smoke", first.scenario), check_smoke)
+        drawing = partial(node_drawing, config.render_device)
+        startup = WorkerStartup(drawing, ("smoke", first.scenario), check_first_reply)
     return open_ray_engine(
         run,
         make_host,
-        workplace,
-        slots=places.slots,
-        replicas=places.replicas,
-        gpus=1.0 if places.device.startswith("cuda") else 0.0,
+        config.workplace,
+        slots=config.slots,
+        replicas=config.replicas,
+        gpus=1.0 if config.device.startswith("cuda") else 0.0,
         startup=startup,
-        snapshot_dir=places.snapshot_dir,
+        snapshot_dir=config.snapshot_dir,
         most=len(units),
         **options,
     )
+
+
+def _open_local_engine(
+    run: EvalSession,
+    units: Sequence[WorkItem],
+    make_host: Callable[[], PolicyRunner],
+    config: EngineConfig,
+    stop: Callable[[], bool],
+    options: Mapping[str, Any],
+) -> Engine:
+    """Starts worker processes, has each make its first task and a picture while the policy loads in this
+    process, and puts both together."""
+    if config.draws:
+        run.pool.configure(environment=render_environment(config.render_device, config.device, egl_devices()))
+    slots = config.slots or default_slots(config.device, usable_cores(), available_gb())
+    workers = run.pool.worker_slots(min(slots, len(units)))
+    begun = list(zip(workers, first_units(units, len(workers)), strict=False))
+    for worker, unit in begun:
+        worker.send(*(("smoke", unit.scenario) if config.draws else ("fingerprint",)))
+    thread = PolicyThread()
+    run.pool.on_close(thread.close)
+    host = thread.call(make_host, stop=stop)
+    # Where no simulator can be made the run is refused; if only some fail, their trials record the failure.
+    replies = [worker.receive() for worker, _ in begun]
+    check_first_reply(replies[0])
+    return Engine(run, workers, [InlineReplica(host, thread, run.policy_watchdog_s)], wait, **options)
+
+
+def check_first_reply(reply: object, where: str = "") -> None:
+    """Refuses to begin a run whose simulators cannot be made, or cannot draw.
+
+    Args:
+        reply: a worker's to its first command, `smoke` or `fingerprint`.
+        where: the machine, where there are several.
+
+    Raises:
+        SimulatorError: with the remedy.
+    """
+    if isinstance(reply, SlotFailure):
+        place = f" on node {where}" if where else ""
+        raise SimulatorError(
+            f"the run was not begun, because the first simulator{place} failed: {reply.message}. "
+            "'roborecover doctor' checks simulators and OpenGL; MUJOCO_GL=osmesa (of roborecover eval "
+            "--runner.render_device=cpu) draws in software, and policies that need no pictures run with "
+            "--env.obs_type=state"
+        )

@@ -6,8 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -20,21 +19,19 @@ from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.errors import OptionError, check_seed
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
-from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
+from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
 from lerobot_roborecover.evaluation.loading import HostSpec, load_host
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
 from lerobot_roborecover.evaluation.videos import VideoRecorder
-from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue
+from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue, units_of
 from lerobot_roborecover.logs.extent import missing
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import check_retry
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.metadata import policy_metadata
-from lerobot_roborecover.policies.policy_thread import CallStoppedError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.renamed_fields import move_old_fields
 from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
@@ -215,82 +212,79 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
         n_episodes=cfg.eval.n_episodes,
         output_dir=out,
     )
-    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts)
-    log = run.require_log()
-    run.protocol = replace(run.protocol, run_seed=cfg.seed)
-    if not run.rows():
-        check_eval_info(out / "eval_info.json", log)
-    if cfg.runner.retried:
-        again, beside = run.retry(cfg.runner.retried)
-        print(f"{pluralize(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr)
-    run.pool.acquire()
-    stopper = StopCondition(cfg.runner.limit_seconds)
-    try:
-        watch = open_watch(
-            cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
-            log=log.path, shard=env.shard,
-        )  # fmt: skip
-        order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
-        units = units_of(order, cfg.eval.n_episodes)
-        tally = watch or RunProgress(run.protocol.start, [s.id for s in scenarios], cfg.eval.n_episodes)
-        tally.add([asdict(r) for r in run.rows()])
-        line = ProgressLine(run.protocol.start, detailed=True)
+    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts, run_seed=cfg.seed)
+    with run:
+        log = run.require_log()
+        if not run.rows():
+            check_eval_info(out / "eval_info.json", log)
+        if cfg.runner.retried:
+            again, beside = run.retry(cfg.runner.retried)
+            print(
+                f"{pluralize(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr
+            )
+        stopper = StopCondition(cfg.runner.limit_seconds)
+        try:
+            return _run(cfg, run, scenarios, stopper)
+        finally:
+            stopper.restore()
+
+
+def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stopper: StopCondition) -> int:
+    """Runs what is missing in the log, reports, and says how to go on where trials are left."""
+    log, ids, out = run.require_log(), [s.id for s in scenarios], cfg.folder
+    watch = open_watch(
+        cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
+        log=log.path, shard=cfg.recovery_env.shard,
+    )  # fmt: skip
+    tally = watch or RunProgress(run.protocol.start, ids, cfg.eval.n_episodes)
+    tally.add([asdict(r) for r in run.rows()])
+    line = ProgressLine(run.protocol.start, detailed=True)
+    line.show(tally)
+
+    def settled() -> bool:
+        if watch is not None and watch.decided and not stopper.reason:
+            stopper.reason = watch.words
+        return watch is not None and watch.decided
+
+    def show(row: TrialRow) -> None:
+        tally.add([asdict(row)])
         line.show(tally)
+        settled()
 
-        def settled() -> bool:
-            if watch is not None and watch.decided and not stopper.reason:
-                stopper.reason = watch.words
-            return watch is not None and watch.decided
-
-        def show(row: TrialRow) -> None:
-            tally.add([asdict(row)])
-            line.show(tally)
-            settled()
-
-        videos, unrun = None, {}
-        if cfg.runner.videos:
-            ids = [s.id for s in scenarios]
-            videos = VideoRecorder(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
-        if watch is not None:
-            watch.record(log.path)
-        if tally.done < tally.total and not settled():
-            options = {
-                "batch_delay_s": cfg.runner.batch_delay_ms / 1e3, "on_row": show, "videos": videos,
-                "queue_of": WorkQueue if watch is None else OrderedQueue,
-            }  # fmt: skip
-            make_host = partial(load_host, host_spec(cfg))
-            with suppress(CallStoppedError):  # the time was up before the policy was loaded
-                engine = open_engine(run, units, make_host, _places(cfg), stop=stopper, **options)
-                engine.run(units, stopper)
-                unrun = engine.unrun
-        line.show(tally, final=True)
-        if watch is not None:
-            record = watch.record(log.path)
-        report(cfg, run, scenarios, [] if videos is None else videos.kept)
-        if watch is not None and record is not None:
-            print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
-            if watch.decided:
-                return 0
-        if stopper.reason:
-            print(
-                f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, run the same "
-                f"command with --env.trial_log={log.path} --output_dir={out}",
-                file=sys.stderr,
-            )
-            return stopper.status
-        if unrun:
-            (scenario, trial), reason = next(iter(unrun.items()))
-            print(
-                f"{pluralize(len(unrun), 'trial')} could not be run, and left no row: the policy was away or "
-                f"hung (trial {trial} of {scenario}: {reason}). To go on, run the same command with "
-                f"--env.trial_log={log.path} --output_dir={out}",
-                file=sys.stderr,
-            )
-            return 1
-        return 0
-    finally:
-        stopper.restore()
-        run.pool.release()
+    videos, result = None, RunResult()
+    if cfg.runner.videos:
+        videos = VideoRecorder(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
+    if watch is not None:
+        watch.record(log.path)
+    if not settled():
+        order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
+        result = run_work_items(
+            run, units_of(order, cfg.eval.n_episodes), partial(load_host, host_spec(cfg)), _places(cfg),
+            stop=stopper, on_row=show, videos=videos, batch_delay_s=cfg.runner.batch_delay_ms / 1e3,
+            queue_of=WorkQueue if watch is None else OrderedQueue,
+        )  # fmt: skip
+    line.show(tally, final=True)
+    if watch is not None:
+        record = watch.record(log.path)
+    report(cfg, run, scenarios, [] if videos is None else videos.kept)
+    if watch is not None and record is not None:
+        print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
+        if watch.decided:
+            return 0
+    go_on = f"run the same command with --env.trial_log={log.path} --output_dir={out}"
+    if stopper.reason:
+        print(
+            f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, {go_on}", file=sys.stderr
+        )
+        return stopper.status
+    if result.unrun:
+        print(
+            f"{pluralize(len(result.unrun), 'trial')} could not be run, and left no row: the policy was away "
+            f"or hung ({result.problem}). To go on, {go_on}",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
 
 
 def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:

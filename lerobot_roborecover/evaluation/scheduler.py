@@ -5,8 +5,8 @@ The engine is one event loop. A slot goes through these states:
     idle -> its trial's states (`evaluation.trial`), from handing off to over -> idle
 
 Waiting trials share one batch. A free slot starts the next trial at once. While a policy infers for some
-slots, the simulators of the others step. The engine gets its slots and policies from outside: from this
-process and its children (`local`), or from a cluster (`ray_engine`).
+slots, the simulators of the others step. The engine gets its slots and policies from outside (`launch`): from
+this process and its children, or from a cluster (`ray_engine`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lerobot_roborecover.evaluation.batching import BatchTimer
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import Act, Trial
 from lerobot_roborecover.evaluation.videos import VideoRecorder
-from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue
+from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue, unfinished
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.action_checks import count_problem
 from lerobot_roborecover.policies.runner import (
@@ -30,8 +30,7 @@ from lerobot_roborecover.policies.runner import (
     ReplicaHungError,
     ReplicaLostError,
 )
-from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, TrialStart
-from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.scenario import Outcome, TrialStart
 from lerobot_roborecover.workers.control_columns import strip_columns
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackReply, SlotFailure
 from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
@@ -122,20 +121,6 @@ class Engine:
             while (unit := self._queue.take(None)) is not None:
                 self.unrun[unit.scenario.id, unit.trial] = reasons[0]
         return self._finished
-
-    def check_all_run(self) -> None:
-        """Checks that no trial was left for another run.
-
-        Raises:
-            ScenarioError: some were; the same command goes on.
-        """
-        if self.unrun:
-            (scenario, trial), reason = next(iter(self.unrun.items()))
-            raise ScenarioError(
-                f"{pluralize(len(self.unrun), 'trial')} could not be run: the policy was away or hung (trial "
-                f"{trial} of {scenario}: {reason}). What has finished is kept: once the policy answers, run "
-                "the same command again"
-            )
 
     def _sittings(self) -> list[ActiveTrial]:
         """The trials under way, in the order of their workers."""
@@ -366,16 +351,3 @@ class Engine:
         row = self._run.record(trial, noise=noise, batch_size=host.max_batch if host.batched else 1)
         self._finished += 1
         self._on_row(row)
-
-
-def unfinished[S: TrialStart](run: EvalSession, units: Sequence[WorkItem[S]]) -> list[WorkItem[S]]:
-    """Units that the run's trial log does not hold yet."""
-    if run.log is None:
-        return list(units)
-    keys = run.keys([(u.scenario, u.trial) for u in units])
-    return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
-
-
-def units_of(scenarios: Sequence[Scenario], trials: int) -> list[WorkItem[Scenario]]:
-    """All trials of all scenarios."""
-    return [WorkItem(s, k) for s in scenarios for k in range(trials)]

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class SimulatorSpec:
 
 @dataclass
 class EvalSession:
-    """What all scenarios of a run share."""
+    """What all scenarios of a run share. As a context, it ends workers and log when the last user leaves."""
 
     pool: SlotPool
     protocol: EvalProtocol
@@ -79,6 +79,13 @@ class EvalSession:
     """Longest time of one inference in seconds; infinite for no limit."""
     on_trial_end: Callable[[Trial, TrialRow], None] = lambda trial, row: None
     """Called when a trial ends, before its row is written."""
+
+    def __enter__(self) -> Self:
+        self.pool.acquire()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pool.release()
 
     def action_width(self, scenario: TrialStart) -> int:
         """Values in a policy's action, which need not be those of the scenario's prefix."""
@@ -164,6 +171,7 @@ def create_session(
     workers: bool,
     facts: PolicyMetadata | None = None,
     scenarios: ScenarioSet | None = None,
+    run_seed: int | None = None,
 ) -> tuple[ScenarioSet, EvalSession]:
     """Checks everything, loads the scenarios and opens the trial log; no simulator starts yet.
 
@@ -173,6 +181,7 @@ def create_session(
         workers: simulators in processes of their own, or in this one.
         facts: who is evaluated, and how much of it.
         scenarios: what to run in place of those that the options name.
+        run_seed: seed of the run; None where the caller sets one later, or has none.
 
     Raises:
         OptionError: an option, or the batch size, cannot be used.
@@ -201,7 +210,7 @@ def create_session(
         start=start.value,
         rewind_steps=options.rewind_steps if start is Start.REVERSION else 0,
         policy=facts.policy,
-        run_seed=None,
+        run_seed=run_seed,
         execution_horizon=facts.execution_horizon,
         policy_settings=facts.policy_settings,
         options=decisive,

@@ -4,10 +4,14 @@ can."""
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from lerobot_roborecover.scenario import TrialStart
+from lerobot_roborecover.scenario import Scenario, TrialStart
+
+if TYPE_CHECKING:
+    from lerobot_roborecover.evaluation.session import EvalSession
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,19 @@ class WorkItem[S: TrialStart]:
     def task(self) -> tuple[str, str]:
         """What decides the compiled model."""
         return self.scenario.task.suite, self.scenario.task.name
+
+
+def units_of(scenarios: Iterable[Scenario], trials: int) -> list[WorkItem[Scenario]]:
+    """Returns all trials of all scenarios."""
+    return [WorkItem(s, k) for s in scenarios for k in range(trials)]
+
+
+def unfinished[S: TrialStart](run: EvalSession, units: Sequence[WorkItem[S]]) -> list[WorkItem[S]]:
+    """Returns the units that the run's trial log does not hold yet."""
+    if run.log is None:
+        return list(units)
+    keys = run.keys([(u.scenario, u.trial) for u in units])
+    return [u for u, key in zip(units, keys, strict=True) if run.log.find(key) is None]
 
 
 def first_units(

@@ -16,12 +16,11 @@ from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.evaluation.child import CANNOT_START, run_module, stop_running
 from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
-from lerobot_roborecover.evaluation.sizes import SLOT_GB
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.determinism import has_kernels
 from lerobot_roborecover.utils.text import output_end
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.capacity import SLOT_GB, available_gb, usable_cores
 from recipes.study.arms import StudyArm, arms, report_command
 from recipes.study.definition import StudyDefinition
 from recipes.study.outcomes import (

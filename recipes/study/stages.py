@@ -12,9 +12,8 @@ from lerobot_roborecover.curation.pipeline.config import ChainConfig
 from lerobot_roborecover.curation.screen.screening import ScreenRule
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.datasets.load import builtin_names
-from lerobot_roborecover.evaluation.sizes import default_slots
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
 from recipes.study.recipe import StudyRecipe
 
 CHECKPOINT = Path("checkpoints") / "last" / "pretrained_model"

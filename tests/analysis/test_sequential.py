@@ -29,12 +29,11 @@ from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, Compari
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
-from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkItem
+from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkItem, units_of
 from lerobot_roborecover.logs.sequential_record import read_record, record_path
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
 from lerobot_roborecover.policies.metadata import PolicyMetadata
@@ -189,7 +188,7 @@ def evaluate(dataset, log, policy, host, against=""):
             watch.add([asdict(r) for r in run.log.rows])
         stop = (lambda: watch.decided) if watch else (lambda: False)
         # One slot: of several, one that starts late would let the others run ahead.
-        LocalEngine(run, host, slots=1, **options).run(units, stop)
+        run_work_items(run, units, lambda: host, EngineConfig(slots=1), stop=stop, **options)
         if watch is not None:
             watch.record(run.log.path)
     finally:

@@ -250,16 +250,16 @@ def test_tasks_that_a_scripted_controller_cannot_do_are_left_out_by_name(tmp_pat
 def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_path, monkeypatch):
     """As where a cluster's machine with the policy is lost for good."""
     from lerobot_roborecover.curation.collect.rollouts import run_policy
-    from lerobot_roborecover.evaluation.scheduler import Engine
 
     class Away:
+        reruns = 0
         unrun: ClassVar = {("toy-p-s0", 0): "nobody answers"}
-        check_all_run = Engine.check_all_run
 
-        def run(self, units):
+        def run(self, units, stop):
             assert [u.scenario.seed for u in units] == [0]
+            return 0
 
-    monkeypatch.setattr("lerobot_roborecover.evaluation.launch.open_engine", lambda *_: Away())
+    monkeypatch.setattr("lerobot_roborecover.evaluation.launch.open_engine", lambda *_, **__: Away())
     planned = SimpleNamespace(seed=0, trial=0, driver="p")
     with pytest.raises(ScenarioError, match=r"1 trial could not be run.*nobody answers.*command again"):
         run_policy([[planned]], None, None, None, 7, lambda ended, record: None)

@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
-from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue, first_units
+from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue, first_units, units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.policies.runner import PolicyError
@@ -64,7 +63,8 @@ def run_engine(dataset, log, *, slots=3, host=None, stop=lambda: False, step_s=0
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        LocalEngine(run, host or PushHost(), slots=slots).run(units_of(list(scenarios), TRIALS), stop)
+        units = units_of(list(scenarios), TRIALS)
+        run_work_items(run, units, lambda: host or PushHost(), EngineConfig(slots=slots), stop=stop)
     finally:
         run.pool.release()
     return read_trial_log(log)
@@ -141,7 +141,7 @@ def test_a_scenario_that_keeps_breaking_is_parked(tmp_path):
     )  # fmt: skip
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
-    LocalEngine(run, PushHost(), slots=2).run(units_of(list(scenarios), 6))
+    run_work_items(run, units_of(list(scenarios), 6), PushHost, EngineConfig(slots=2))
     run.pool.release()
     rows = [r for r in read_trial_log(tmp_path / "log.jsonl") if r.scenario_id == bad.id]
     assert {r.outcome for r in rows} == {"sim_error"}

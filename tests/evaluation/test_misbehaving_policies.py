@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.policies.policy_thread import CallTimeoutError, PolicyThread
@@ -61,7 +61,7 @@ class BlockingHost(PushHost):
 
 
 def run_engine(dataset, log, host, stop=lambda: False, **options):
-    """The engine after its run, and the log's rows."""
+    """What the run came to, and the log's rows."""
     scenarios, run = create_session(
         RecoveryOptions(scenarios=str(dataset), trial_log=str(log), **options),
         SimulatorSpec(SlotConfig("fake"), {}, None),
@@ -71,11 +71,11 @@ def run_engine(dataset, log, host, stop=lambda: False, **options):
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        engine = LocalEngine(run, host, slots=COUNT)
-        engine.run(units_of(list(scenarios), TRIALS), stop)
+        units = units_of(list(scenarios), TRIALS)
+        result = run_work_items(run, units, lambda: host, EngineConfig(slots=COUNT), stop=stop)
     finally:
         run.pool.release()
-    return engine, read_trial_log(log)
+    return result, read_trial_log(log)
 
 
 def signed(columns):

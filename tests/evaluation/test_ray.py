@@ -15,8 +15,8 @@ import pytest
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.workers.backend import Backend

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.merge import merge
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.metadata import PolicyMetadata
@@ -54,7 +54,8 @@ def run_engine(root, log, host, *, slots=2, stop=lambda: False, **options):
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        LocalEngine(run, host, slots=slots).run(units_of(list(scenarios), TRIALS), stop)
+        units = units_of(list(scenarios), TRIALS)
+        run_work_items(run, units, lambda: host, EngineConfig(slots=slots), stop=stop)
     finally:
         run.pool.release()
     return read_trial_log(log)

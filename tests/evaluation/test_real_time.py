@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.real_time import LatencyModel, RealTime
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.vector_env import create_recovery_envs
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.interventions.options import InterventionFacts
 from lerobot_roborecover.policies.metadata import PolicyMetadata
@@ -143,7 +143,7 @@ def engine(dataset, log, *, slots=2, horizon=CHUNK, **options):
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        LocalEngine(run, ChunkHost(), slots=slots).run(units_of(list(scenarios), TRIALS))
+        run_work_items(run, units_of(list(scenarios), TRIALS), ChunkHost, EngineConfig(slots=slots))
     finally:
         run.pool.release()
     return read_trial_log(log)

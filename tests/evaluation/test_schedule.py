@@ -10,11 +10,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from lerobot_roborecover.evaluation.batching import BatchTimer
-from lerobot_roborecover.evaluation.scheduler import Engine, units_of
+from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.sizes import default_slots
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.row import EvalProtocol
 from lerobot_roborecover.policies.runner import InlineReplica
+from lerobot_roborecover.workers.capacity import default_slots
 from tests.support.factories import fake_scenario
 from tests.support.virtual_time import VirtualHost, VirtualSlot, World
 

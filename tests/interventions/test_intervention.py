@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.vector_env import create_recovery_envs
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.interventions.options import InterventionFacts
 from lerobot_roborecover.policies.metadata import PolicyMetadata
@@ -96,7 +96,7 @@ def engine_rows(dataset, log, made, mode, slots):
     run.pool.acquire()
     try:
         host = policy.make_host(lambda b: b, lambda a: a, pre, 64)
-        LocalEngine(run, host, slots=slots).run(units_of(list(scenarios), TRIALS))
+        run_work_items(run, units_of(list(scenarios), TRIALS), lambda: host, EngineConfig(slots=slots))
     finally:
         run.pool.release()
     return read_trial_log(log)
@@ -209,7 +209,7 @@ def test_mode_reversion_and_start_reversion_agree(dataset, checkpoints, tmp_path
     run.pool.acquire()
     policy, pre, _ = composite(checkpoints, "direct")
     host = policy.make_host(lambda b: b, lambda a: a, pre, 64)
-    LocalEngine(run, host, slots=1).run(units_of(list(scenarios), TRIALS))
+    run_work_items(run, units_of(list(scenarios), TRIALS), lambda: host, EngineConfig(slots=1))
     run.pool.release()
     started = read_trial_log(tmp_path / "s.jsonl")
     assert {(r.scenario_id, r.trial): (r.outcome, r.steps, r.actions_sha256) for r in rolled} == {

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.evaluation.local_engine import LocalEngine
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.scheduler import units_of
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.vector_env import create_recovery_envs
+from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.row import trial_seed
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import make_simulator
@@ -68,7 +68,7 @@ def engine_rows(dataset, log, host, slots):
     run.protocol = replace(run.protocol, run_seed=1000)
     run.pool.acquire()
     try:
-        LocalEngine(run, host, slots=slots).run(units_of(list(scenarios), TRIALS))
+        run_work_items(run, units_of(list(scenarios), TRIALS), lambda: host, EngineConfig(slots=slots))
     finally:
         run.pool.release()
     return read_trial_log(log)

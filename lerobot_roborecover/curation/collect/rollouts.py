@@ -144,14 +144,14 @@ def run_policy(
             pass have different ids.
         pool: of slots with `collect_server.SERVER`.
         make_host: loads the policy.
-        places: where, `trials.places.EngineConfig`.
+        places: where, `an `EngineConfig` of `evaluation.launch``.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
         on_end: told of each.
 
     Raises:
         ScenarioError: the policy went away, so that some were not driven.
     """
-    from lerobot_roborecover.evaluation.launch import open_engine
+    from lerobot_roborecover.evaluation.launch import run_work_items
 
     def keep(trial: Trial, row: TrialRow) -> None:
         assert isinstance(trial.scenario, RolloutSpec)
@@ -160,11 +160,7 @@ def run_policy(
         )
 
     for wanted in passes:
-        if not wanted:
-            continue
         units = [WorkItem(u, u.trial) for u in wanted]
-        protocol = EvalProtocol("recovery", 0, wanted[0].driver, seed, None)
+        protocol = EvalProtocol("recovery", 0, wanted[0].driver if wanted else "", seed, None)
         run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, on_trial_end=keep)
-        engine = open_engine(run, units, make_host, places)
-        engine.run(units)
-        engine.check_all_run()
+        run_work_items(run, units, make_host, places).check_all_run()

@@ -24,11 +24,10 @@ from lerobot_roborecover.curation.video_settings import VideoSettings
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.progress import ProgressLine
 from lerobot_roborecover.evaluation.session import SimulatorSpec
-from lerobot_roborecover.evaluation.sizes import default_slots
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, ScenarioError
 from lerobot_roborecover.workers.backend import WorkerStartup
-from lerobot_roborecover.workers.capacity import available_gb, usable_cores
+from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
 from lerobot_roborecover.workers.dispatch import failed
 from lerobot_roborecover.workers.slots import SlotPool
 

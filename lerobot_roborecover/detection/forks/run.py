@@ -21,10 +21,9 @@ from lerobot_roborecover.detection.forks.arms import ForkArm
 from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, rows_of, usable, with_actions
 from lerobot_roborecover.detection.forks.trial import ANOTHER, OWN, Fork, ForkRun, TeacherForcedRunner
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.launch import EngineConfig, open_engine
-from lerobot_roborecover.evaluation.scheduler import unfinished
+from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
-from lerobot_roborecover.evaluation.work_items import WorkItem
+from lerobot_roborecover.evaluation.work_items import WorkItem, unfinished
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyRunner
@@ -115,16 +114,13 @@ def run_forks(
     env = _env(request, rows[0][1], sorted({row.scenario_id for _, row in rows}))
     env.trial_log, env.record_actions = str(request.out / TRIALS_FILE), True
     scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts)
-    run.pool.acquire()
-    try:
+    with run:
         for _, row in rows:
             _check_same(run, row)
         parents = with_actions(rows, {s.id: s for s in scenarios})
         found: list[TrialRow] = []
         for arm in (ForkArm(CONTINUE), *(a for a in request.arms if a.kind != CONTINUE)):
             found += _run_arm(request, env, run, arm, base, parents, on_fork)
-    finally:
-        run.pool.release()
     return ForkResult(request.out / TRIALS_FILE, tuple(found), len(parents), dropped)
 
 
@@ -175,12 +171,9 @@ def _run_arm(
         done[0] += 1
         on_fork(arm.kind, done[0], len(units))
 
-    if todo:
-        places = EngineConfig(slots=request.slots, device=str(config.device), draws=env.obs_type != "state")
-        make_host = partial(_host, request, env, config, arm)
-        engine = open_engine(run, todo, make_host, places, on_row=told)
-        engine.run(todo)
-        engine.check_all_run()
+    places = EngineConfig(slots=request.slots, device=str(config.device), draws=env.obs_type != "state")
+    make_host = partial(_host, request, env, config, arm)
+    run_work_items(run, todo, make_host, places, on_row=told).check_all_run()
     keys = set(run.keys([(u.scenario, u.trial) for u in units]))
     return [row for row in run.require_log().rows if row.key() in keys]
 
