@@ -81,7 +81,6 @@ def _words(key: tuple[str, str, float]) -> str:
 
 
 def latency_table(rates: Sequence[LatencyRate], level: float = LEVEL) -> Table:
-    """The figure's numbers."""
     columns = (
         Column("Policy"), Column("Inference"), Column("Scenarios", "count"), Column("Trials", "count"),
         Column("Invalid", "count"), Column("RSR %", "percent"),

@@ -40,7 +40,6 @@ OPTIONS = CompareOptions
 
 
 def run(options: CompareOptions) -> int:
-    """Prints the comparison."""
     from lerobot_roborecover.analysis.compare import compare, to_json, to_screen
     from lerobot_roborecover.analysis.logs import read_study
     from lerobot_roborecover.analysis.sequential_plan import planned_units

@@ -24,7 +24,6 @@ OPTIONS = ExportEmaOptions
 
 
 def run(options: ExportEmaOptions) -> int:
-    """Writes the checkpoint."""
     from lerobot_roborecover.policies.export_ema import export_ema
 
     count = export_ema(options.checkpoint.resolve(), options.out)

@@ -28,7 +28,6 @@ OPTIONS = PullOptions
 
 
 def run(options: PullOptions) -> int:
-    """Pulls."""
     from lerobot_roborecover.datasets.pull import pull_dataset
 
     done = pull_dataset(

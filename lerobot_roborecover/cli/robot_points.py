@@ -11,7 +11,6 @@ OPTIONS = RobotPointsOptions
 
 
 def run(options: RobotPointsOptions) -> int:
-    """Writes the points."""
     from lerobot_roborecover.robot.make_points import make_points
 
     return make_points(options, print)

@@ -27,7 +27,6 @@ class Command:
 
     @property
     def word(self) -> str:
-        """Its name within its group."""
         return self.name.rpartition(" ")[2]
 
 

@@ -27,7 +27,6 @@ def add_workplace(parser: argparse.ArgumentParser, *, policies: bool) -> None:
 
 
 def workplace(args: argparse.Namespace) -> Backend:
-    """What they say."""
     from lerobot_roborecover.workers.backend import Backend
 
     return Backend(args.engine, args.ray_address)

@@ -163,7 +163,6 @@ def nominal_terms(counts: np.ndarray) -> np.ndarray:
 
 
 def nominal_parts(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of alpha for labels."""
     total = sums[..., 1:].sum(-1)
     expected = (sums[..., 1:] * (total[..., None] - sums[..., 1:])).sum(-1)
     return sums[..., 0] / total, expected / (total * (total - 1))

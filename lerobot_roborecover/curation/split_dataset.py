@@ -157,7 +157,6 @@ def report_splits(scenarios: Sequence[Scenario], apart: tuple[str, ...] | None) 
 
 
 def format_report(report: SplitReport) -> str:
-    """The report as text."""
     names = list(report.counts)
     lines = [
         f"{pluralize(sum(report.counts.values()), 'scenario')} in {pluralize(report.groups, 'group')}, "

@@ -180,7 +180,6 @@ class _VideoWriter:
         self._container.mux(self._stream.encode(self._av.VideoFrame.from_ndarray(picture, format="rgb24")))
 
     def close(self) -> None:
-        """Flushes and closes the file."""
         if self._started:
             self._container.mux(self._stream.encode())
         self._container.close()
@@ -222,7 +221,6 @@ class _Recording:
             stream.log("recovery_point", rerun.TextLog(text, level=rerun.TextLogLevel.WARN))
 
     def close(self) -> None:
-        """Writes what is still held back."""
         self._stream.flush()
         self._stream.disconnect()
 

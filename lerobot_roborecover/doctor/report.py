@@ -18,7 +18,6 @@ def format_report(checks: Sequence[Check]) -> str:
 
 
 def check_lines(check: Check) -> list[str]:
-    """One check as text."""
     lines = [f"{check.status.value:<8} {check.name}: {check.detail}"]
     if check.remedy:
         lines += textwrap.wrap(
@@ -33,7 +32,6 @@ def check_lines(check: Check) -> list[str]:
 
 
 def count_line(checks: Sequence[Check]) -> str:
-    """How many came out how."""
     counts = {status: sum(check.status is status for check in checks) for status in Status}
     return (
         f"{len(checks)} checks: {counts[Status.OK]} ok, {counts[Status.WARNING]} warnings, "

@@ -16,7 +16,6 @@ MINIMUM_PYTHON = (3, 12)
 
 
 def check_python() -> Check:
-    """The interpreter."""
     found = f"{platform.python_version()} ({sys.executable})"
     if sys.version_info[:2] >= MINIMUM_PYTHON:
         return Check("Python", Status.OK, found)

@@ -29,7 +29,6 @@ class Finding:
 
 
 def ok(name: str, value: str, expected: str = "") -> Finding:
-    """A check that came out well."""
     return Finding(name, Status.OK, value, expected)
 
 

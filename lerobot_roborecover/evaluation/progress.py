@@ -80,12 +80,10 @@ class RunProgress:
 
     @property
     def total(self) -> int:
-        """Trials asked for."""
         return len(self._ids) * self._trials
 
     @property
     def done(self) -> int:
-        """Trials finished."""
         return len(self._seen)
 
     @property

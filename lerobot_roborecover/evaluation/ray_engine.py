@@ -47,7 +47,6 @@ class PolicyActor:
         self._histories[token] = self._host.start(seed)
 
     def finish(self, token: int) -> None:
-        """Gives a history back."""
         self._host.finish(self._histories.pop(token))
 
     def act(
@@ -94,11 +93,9 @@ class RayReplica(RestartableActor):
         return self._tokens
 
     def finish(self, history: int) -> None:
-        """Gives back what a trial held."""
         self._actor.finish.remote(history)
 
     def submit(self, observations: list, instructions: list[str], histories: list) -> None:
-        """Begins an inference."""
         self.ready = self._actor.act.remote(observations, instructions, histories)
         self.deadline = time.monotonic() + self._limit_s
 

@@ -80,17 +80,14 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
 
     @cached_property
     def observation_space(self) -> gym.Space:
-        """The batch's observation."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
     def single_action_space(self) -> gym.Space:
-        """One trial's action."""
         return platform_named(self.scenario.platform).action_space(self.run.action_width(self.scenario))
 
     @cached_property
     def action_space(self) -> gym.Space:
-        """The batch's actions."""
         return batch_space(self.single_action_space, self.num_envs)
 
     # --- a batch of trials

@@ -25,7 +25,6 @@ class Missing:
 
     @property
     def words(self) -> str:
-        """Both in one phrase."""
         return "; ".join(filter(None, (self.scenarios, self.trials)))
 
 

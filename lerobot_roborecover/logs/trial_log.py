@@ -320,5 +320,4 @@ class TrialLog:
             self._kinds[kind] += 1
 
     def close(self) -> None:
-        """Releases the file."""
         self._file.close()

@@ -51,7 +51,6 @@ class StateEnvConfig(EnvConfig, VideoEnvMixin):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
         return {"obs_type": self.obs_type, "observation_size": self.observation_size}
 
     def simulator_setup(self) -> SimulatorSetup:

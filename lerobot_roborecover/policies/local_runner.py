@@ -143,7 +143,6 @@ class LocalPolicyRunner:
             history.stream = self._stream_state()
 
     def finish(self, history: PolicyState) -> None:
-        """Gives back what a trial held."""
         if history.policy is not None:
             self._idle.append(history.policy)
             history.policy = None

@@ -159,7 +159,6 @@ class InlineReplica:
         """Nothing to find out."""
 
     def submit(self, observations: list, instructions: list[str], histories: list) -> None:
-        """Remembers the question."""
         self._asked = (observations, instructions, histories)
 
     def result(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError] | None:
@@ -199,19 +198,15 @@ class WatchedHost:
 
     @property
     def max_batch(self) -> int:
-        """As the policy's."""
         return self._host.max_batch
 
     def noise(self, seed: int | None) -> str:
-        """As the policy's."""
         return self._host.noise(seed)
 
     def start(self, seed: int | None) -> Any:
-        """As the policy's."""
         return self._host.start(seed)
 
     def finish(self, history: Any) -> None:
-        """As the policy's."""
         self._host.finish(history)
 
     def act(
@@ -233,5 +228,4 @@ class WatchedHost:
         return [PolicyError(self._replica.gone)] * len(observations)
 
     def close(self) -> None:
-        """Ends the thread."""
         self._thread.close()

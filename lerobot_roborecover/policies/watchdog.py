@@ -64,7 +64,6 @@ class PolicyWatch:
             self._waiting = None
 
     def close(self) -> None:
-        """Ends the watchdog."""
         self._closed.set()
 
     def _work(self) -> None:

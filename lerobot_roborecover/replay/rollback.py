@@ -76,7 +76,6 @@ class RollbackHistory:
             self._simulator.set_control_mode(self._control_mode)
 
     def step(self, action: np.ndarray) -> None:
-        """Advances the simulator."""
         if self._ring.maxlen:
             self._ring.append((self.position, self._simulator.snapshot()))
         self._simulator.step(action)

@@ -65,11 +65,9 @@ class ReproductionPlan:
                 raise OptionError(f"--set {argument.lstrip('-')}: an option of roborecover eval, NAME=VALUE")
 
     def folder(self, start: str) -> Path:
-        """Of an arm's results."""
         return self.out / start
 
     def log(self, start: str) -> Path:
-        """Trial log of an arm."""
         return self.folder(start) / "trials.jsonl"
 
     def argv(self, start: str) -> list[str]:

@@ -24,7 +24,6 @@ class WallClock:
         return time.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Waits."""
         if seconds > 0:
             time.sleep(seconds)
 
@@ -40,7 +39,6 @@ class SteppedClock:
         return self._now
 
     def sleep(self, seconds: float) -> None:
-        """Goes on."""
         self._now += max(seconds, 0.0)
 
 

@@ -24,12 +24,10 @@ class HeldRobot(Robot):
 
     @property
     def observation_features(self) -> dict:
-        """The robot's own."""
         return self.held.observation_features
 
     @property
     def action_features(self) -> dict:
-        """The robot's own."""
         return self.held.action_features
 
     @property

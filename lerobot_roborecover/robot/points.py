@@ -66,7 +66,6 @@ class RobotPoint:
 
     @property
     def id(self) -> str:
-        """The scenario's."""
         return self.scenario.id
 
     @property

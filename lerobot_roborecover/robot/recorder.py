@@ -39,7 +39,6 @@ class RobotNotes:
 
 
 def notes_of(robot: Any, fps: float) -> RobotNotes:
-    """Of a connected robot."""
     units = joint_units(robot)
     return RobotNotes(robot.name, calibration_sha256(robot), joint_names(robot), units, float(fps))
 

@@ -87,5 +87,4 @@ class RunJournal:
             atomic_write(self.log, text)
 
     def close(self) -> None:
-        """Lets go of the journal."""
         self._journal.close()

@@ -133,7 +133,6 @@ class AppendOnly:
         old.close()
 
     def close(self) -> None:
-        """Lets go of the file."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -269,7 +268,6 @@ class Journal:
         self.records += whole
 
     def close(self) -> None:
-        """Lets go of the file."""
         self._file.close()
 
     def __enter__(self) -> Self:

@@ -46,7 +46,6 @@ class Progress:
             self.close()
 
     def close(self) -> None:
-        """Leaves the bar as it stands."""
         if self._bar is not None:
             self._bar.close()
         self._bar, self._what = None, ""

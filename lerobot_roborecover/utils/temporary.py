@@ -37,7 +37,6 @@ class TemporaryFolder:
         self._remove = weakref.finalize(self, _remove, self.path, lock, os.getpid())
 
     def close(self) -> None:
-        """Removes the folder."""
         self._remove()
 
     def __enter__(self) -> Path:

@@ -78,7 +78,6 @@ class JobServer:
 
     @property
     def simulator(self) -> Simulator:
-        """Made when first asked for."""
         if self._simulator is None:
             self._simulator = make_simulator(self._config.platform, **self._config.options)
         return self._simulator
@@ -95,7 +94,6 @@ class JobServer:
             return JobError(_picklable(err))
 
     def close(self) -> None:
-        """Closes the simulator."""
         if self._simulator is not None:
             self._simulator.close()
 

@@ -40,7 +40,6 @@ class SlotConfig:
     command; None for the usual."""
 
     def make_server(self) -> Server:
-        """The server, in this process."""
         module, _, name = self.server.partition(":")
         return getattr(importlib.import_module(module), name)(self)
 

@@ -112,5 +112,4 @@ class SlotServer:
         return ActResult(observation, steps, success, over, seconds, tuple(frames), progress=tuple(progress))
 
     def close(self) -> None:
-        """Closes the simulator."""
         self._simulator.close()

@@ -87,7 +87,6 @@ class InlineSlot:
         self._pending = (command, argument)
 
     def receive(self) -> Reply:
-        """Runs the command."""
         assert self._pending is not None, "receive without send"
         command, argument = self._pending
         self._pending = None
@@ -100,7 +99,6 @@ class InlineSlot:
             return SlotFailure("raised", f"{type(err).__name__}: {err}")
 
     def close(self) -> None:
-        """Closes the simulator."""
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -346,7 +344,6 @@ class SlotPool:
         return self._spaces
 
     def close(self) -> None:
-        """Ends all slots."""
         for slot in self._slots:
             slot.close()
         self._slots = []

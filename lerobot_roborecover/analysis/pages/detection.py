@@ -138,7 +138,6 @@ def pair_table(found: Sequence[Contrast], level: float) -> Table:
 
 
 def input_table(measured: Sequence[MeasuredDetector]) -> Table:
-    """What each of them is."""
     columns = (Column("Detector"), Column("What"), Column("Reads"), Column("Fitted to"), Column("Saved"))
     rows = tuple((m.name, m.what, m.reads, m.fitted_to or "nothing", m.saved or "no") for m in measured)
     return Table("inputs", "What they are", columns, rows)

@@ -46,7 +46,6 @@ def write_leaderboard(
 
 
 def board_table(board: Board, number: int = 0) -> Table:
-    """One board's entries."""
     rows, several = [], any(entry.runs > 1 for entry in board.entries)
     own_macro = bool(board.cells.counted) and not board.cells.is_macro_9
     for rank, entry in zip(ranks(board), board.entries, strict=True):

@@ -47,7 +47,6 @@ class Contrast:
 
     @property
     def verdict(self) -> ComparisonVerdict:
-        """What may be said of the two."""
         return verdict(self)
 
     def reversed(self) -> Contrast:

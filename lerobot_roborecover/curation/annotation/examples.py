@@ -77,7 +77,6 @@ class Examples:
         return None
 
     def close(self) -> None:
-        """Ends the rendering."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

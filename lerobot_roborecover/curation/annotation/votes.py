@@ -235,7 +235,6 @@ class VoteJournal:
         self._ballot = ballot(self._journal.records, round_number)
 
     def ballot(self) -> CurrentVotes:
-        """What stands now."""
         return self._ballot
 
     def add(self, vote: Vote) -> Vote:
@@ -278,7 +277,6 @@ class VoteJournal:
                 self._append({"kind": "reveal", "candidate": candidate, "round": self.round})
 
     def close(self) -> None:
-        """Lets go of the file."""
         self._journal.close()
 
     def _append(self, record: Mapping[str, Any]) -> None:

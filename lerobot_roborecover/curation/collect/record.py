@@ -144,7 +144,6 @@ class RecordingSimulator:
         self._plan = planned
 
     def reset(self, task: Any, reset: Reset) -> None:
-        """Begins a record."""
         assert self._plan is not None, "reset without a plan"
         self._recorder.reset(task, reset)
         self._noise = None

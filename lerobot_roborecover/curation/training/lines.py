@@ -53,7 +53,6 @@ class TrainingLine:
 
     @property
     def steps(self) -> int:
-        """Of the episode."""
         return len(self.actions) - self.first
 
     @property

@@ -50,7 +50,6 @@ class SplitRow:
 
     @property
     def sample_id(self) -> str:
-        """The scenario's id."""
         return self.cells["sample_id"]
 
 

@@ -175,11 +175,9 @@ class TeacherForcedRunner:
 
     @property
     def max_batch(self) -> int:
-        """As the policy's."""
         return self._host.max_batch
 
     def noise(self, seed: int | None) -> str:
-        """As the policy's."""
         return self._host.noise(seed)
 
     def start(self, seed: int | None) -> ForcedState:
@@ -197,13 +195,11 @@ class TeacherForcedRunner:
         return ForcedState(self._host.start(seed), steps, stream)
 
     def finish(self, history: ForcedState) -> None:
-        """Gives back what a trial held."""
         self._host.finish(history.inner)
 
     def act(
         self, observations: Sequence, instructions: Sequence[str], histories: Sequence[ForcedState]
     ) -> list[Chunk | PolicyError]:
-        """The policy's chunks."""
         for history in histories:
             if history.left <= 0 and history.stream is not None:
                 reseed: Any = getattr(self._host, "reseed")  # noqa: B009 - not every host has it

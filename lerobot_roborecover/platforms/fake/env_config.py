@@ -22,7 +22,6 @@ class FakeConfig(StateEnvConfig):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
         return {**super().gym_kwargs, "step_s": self.step_s}
 
     def simulator_setup(self) -> SimulatorSetup:

@@ -38,12 +38,10 @@ class BaseEnvConfig(draccus.ChoiceRegistry):
 
     @classmethod
     def default_choice_name(cls) -> str:
-        """PushT."""
         return DEFAULT_TYPE
 
     @classmethod
     def get_known_choices(cls) -> dict[str, Any]:
-        """By name."""
         register_plugins()
         every = EnvConfig.get_known_choices()
         ours = {n: c for n, c in every.items() if not n.startswith(ENV_PREFIX) and n not in _NOT_SIMULATED}
@@ -200,7 +198,6 @@ class LeRobotConfig(EnvConfig, VideoEnvMixin):
         return known | ({} if self.success_key == "is_success" else {"success_key": self.success_key})
 
     def get_env_processors(self) -> tuple[Any, Any]:
-        """The base's."""
         return self.base.get_env_processors()
 
     def simulator_setup(self) -> SimulatorSetup:

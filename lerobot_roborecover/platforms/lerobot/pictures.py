@@ -59,7 +59,6 @@ class UnseenPlane(Unseen):
         self._inner._last_action = None
 
     def complete(self, seen: Observation) -> Observation:
-        """Draws."""
         return dict(self._inner.get_obs()) if self._drawn else _copied(seen)
 
 

@@ -64,7 +64,6 @@ class LeRobotPlatform(Platform):
             raise ScenarioError(f"{self.name} has no suite {task.suite!r}; there is {self.env_type}")
 
     def short_name(self, task: Task) -> str:
-        """With the type."""
         return f"{self.env_type}.{task.name}"
 
     def unsupported_reason(self, task: Task) -> str:
@@ -112,7 +111,6 @@ class LeRobotPlatform(Platform):
         return same and environment[-1:] == (known.environment_width,)
 
     def env_config(self) -> type:
-        """The family's."""
         return FAMILY.env_config()
 
 
@@ -144,11 +142,9 @@ class LeRobotEnvPlatform(Platform):
         return tuple(member_name(kind) for kind in KNOWN)
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
-        """Those of the default member."""
         return member(member_name(DEFAULT_TYPE)).tasks(options)
 
     def make_simulator(self, **options: Any) -> Simulator:
-        """Of the default member."""
         return member(member_name(DEFAULT_TYPE)).make_simulator(**options)
 
     def env_config(self) -> type:

@@ -275,7 +275,6 @@ class LeRobotSimulator:
         return marks
 
     def close(self) -> None:
-        """Closes the environments."""
         for env in self._envs.values():
             env.close()
         self._envs.clear()

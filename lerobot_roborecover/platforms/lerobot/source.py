@@ -42,7 +42,6 @@ class EnvSource:
         return self.hub.partition("@")[0].replace("/", ".") or str(self.config.get("type", ""))
 
     def as_options(self) -> dict[str, Any]:
-        """Plain values."""
         return {key: value for key, value in asdict(self).items() if value}
 
 

@@ -138,7 +138,6 @@ class PymunkState:
         }
 
     def restore(self, parts: Mapping[str, np.ndarray]) -> None:
-        """Refuses."""
         raise SimulatorError("pymunk's solver remembers contacts that cannot be read: replay instead")
 
     def bodies(self, observation: Observation) -> dict[str, Pose]:
@@ -188,7 +187,6 @@ class PairState:
         self._inner.set_state(parts["state"].copy())
 
     def bodies(self, observation: Observation) -> dict[str, Pose]:
-        """As of the observation."""
         return ObservationState().bodies(observation)
 
 
@@ -198,11 +196,9 @@ class ObservationState:
     kind = "the observation alone"
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Nothing more."""
         return {}
 
     def restore(self, parts: Mapping[str, np.ndarray]) -> None:
-        """Refuses."""
         raise SimulatorError("an environment that shows its observation alone cannot be put back: replay")
 
     def bodies(self, observation: Observation) -> dict[str, Pose]:

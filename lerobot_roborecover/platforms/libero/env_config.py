@@ -58,7 +58,6 @@ class LiberoConfig(LiberoEnv, VideoEnvMixin):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
         return {
             "assets_dir": self.assets_dir or None,
             "observation_height": self.observation_height,

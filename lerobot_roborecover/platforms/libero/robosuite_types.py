@@ -159,13 +159,9 @@ class LiberoEnv(Protocol):
     """(3,) metres."""
     _initialize_sim: Callable[[str | None], None]
 
-    def close(self) -> None:
-        """Frees the model."""
-        ...
+    def close(self) -> None: ...
 
-    def get_object(self, name: str) -> _Item:
-        """An object or fixture."""
-        ...
+    def get_object(self, name: str) -> _Item: ...
 
     def reset(self) -> object:
         """Draws the placement anew."""

@@ -257,7 +257,6 @@ class LiberoSimulator:
         return dict(self._fingerprint)
 
     def close(self) -> None:
-        """Frees all compiled tasks."""
         for key in list(self._tasks):
             self._drop(key)
         self._clock = None

@@ -118,12 +118,10 @@ class LiberoTask:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled model."""
         return self.env.sim.model._model
 
     @property
     def data(self) -> mujoco.MjData:
-        """The simulation."""
         return self.env.sim.data._data
 
     @property
@@ -328,7 +326,6 @@ class LiberoTask:
         return arrays
 
     def close(self) -> None:
-        """Frees the model."""
         self._osc = None
         self.env.close()
 

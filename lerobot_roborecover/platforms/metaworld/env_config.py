@@ -53,7 +53,6 @@ class MetaworldConfig(MetaworldEnv, VideoEnvMixin):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
         return {
             "observation_height": self.observation_height,
             "observation_width": self.observation_width,

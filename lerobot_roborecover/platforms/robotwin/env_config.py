@@ -69,7 +69,6 @@ class RobotwinConfig(RoboTwinEnvConfig, VideoEnvMixin):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Options of the simulator."""
         ee = {"endpose": True} if self.action_mode == "ee" else {}
         return {
             **ee,

@@ -103,7 +103,6 @@ class RobotwinPlatform(Platform):
         return observation.get("observation.state", ())[-1:] in ((14,), (16,))
 
     def controls(self) -> Controls:
-        """None."""
         raise ScenarioError(
             "RoboTwin cannot be driven by hand: an action is 14 absolute joint targets, or absolute poses "
             "through a motion planner, and takes 50 to 750 physics steps, so that there is no small motion "
@@ -130,7 +129,6 @@ class RobotwinPlatform(Platform):
         ]
 
     def environment_fingerprint(self, options: Mapping[str, Any]) -> dict[str, str | None]:
-        """The checkout."""
         return {"robotwin_root": options.get("robotwin_root"), ROOT_VARIABLE: os.environ.get(ROOT_VARIABLE)}
 
 

@@ -209,7 +209,6 @@ class RobotwinSimulator:
         )
 
     def close(self) -> None:
-        """Frees the scene."""
         self._task = None
         self._ready = False
 

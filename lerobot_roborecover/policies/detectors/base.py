@@ -71,7 +71,6 @@ class DetectorRewardModel(PreTrainedRewardModel):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """What must be there."""
         raise NotImplementedError
 
     @property

@@ -46,5 +46,4 @@ class RoboRecoverStateDistanceConfig(DetectorConfig):
 
     @property
     def key_list(self) -> list[str]:
-        """The keys."""
         return [k.strip() for k in self.keys.split(",") if k.strip()]

@@ -75,11 +75,9 @@ class FeatureNetwork(DetectorRewardModel):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """The policy's features."""
         return DetectorNeeds(internals=True)
 
     def restore(self, weights: Any) -> None:
-        """Takes saved weights."""
         try:
             self.load_state_dict(weights())
         except RuntimeError as err:

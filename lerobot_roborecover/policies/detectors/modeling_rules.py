@@ -36,7 +36,6 @@ class RoboRecoverConstantRewardModel(DetectorRewardModel):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """Nothing."""
         return DetectorNeeds()
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
@@ -56,7 +55,6 @@ class RoboRecoverElapsedRewardModel(DetectorRewardModel):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """Nothing."""
         return DetectorNeeds()
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:

@@ -101,7 +101,6 @@ class InterventionController:
         return episode
 
     def finish(self, episode: InterventionState) -> None:
-        """Releases what a trial holds."""
         self._leave(episode)
 
     def act(

@@ -57,11 +57,9 @@ class InterventionHost:
         return max((m.noise(seed) for m in self._director.members.values()), key=_NOISE.index)
 
     def start(self, seed: int | None) -> InterventionState:
-        """A trial of that seed."""
         return self._director.start(seed)
 
     def finish(self, history: InterventionState) -> None:
-        """Gives back what a trial held."""
         self._director.finish(history)
 
     def act(

@@ -89,7 +89,6 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         return InterventionHost(self.director, env_preprocessor, env_postprocessor, preprocessor, max_batch)
 
     def reset(self) -> None:
-        """Begins a new batch of trials."""
         for episode in self._episodes:
             self.director.finish(episode)
         self._episodes, self._rows = [], []
@@ -140,7 +139,6 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         raise AssertionError("unreachable")
 
     def get_optim_params(self) -> dict:
-        """Nothing to optimise."""
         return {}
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:

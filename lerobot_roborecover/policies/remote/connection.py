@@ -285,7 +285,6 @@ class RemoteServer:
             self._submit(request)
 
     def close(self) -> None:
-        """Closes every connection."""
         self._closing.set()
         for connection in self._all:
             connection.close()

@@ -51,7 +51,6 @@ class RemoteHost:
         return drawn if seed is not None and drawn in ("per_trial", "per_batch") else "unseeded"
 
     def start(self, seed: int | None) -> RemoteTrial:
-        """A fresh trial."""
         return self._policy.open_slot(seed)
 
     def finish(self, history: RemoteTrial) -> None:

@@ -168,7 +168,6 @@ class RemotePolicy(PreTrainedPolicy):
         raise NotImplementedError("a remote policy is not trained here: its weights are on the server")
 
     def get_optim_params(self) -> dict:
-        """None to train."""
         return {}
 
     def make_host(

@@ -111,7 +111,6 @@ class Batcher:
         self._arrived = asyncio.Event()
 
     async def ask(self, observation: dict, instruction: str, history: Any) -> Chunk | PolicyError:
-        """The policy's answer."""
         answer = asyncio.get_running_loop().create_future()
         self._waiting.append(_Question(observation, instruction, history, answer))
         self._arrived.set()
@@ -122,7 +121,6 @@ class Batcher:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function, *args)
 
     async def run(self) -> None:
-        """Infers for ever."""
         while True:
             await self._arrived.wait()
             until = time.monotonic() + self._delay_s

@@ -63,7 +63,6 @@ class LabRobot(Robot):
 
     @property
     def instruction(self) -> str:
-        """Of the task."""
         return self.world.tasks[self.task]
 
     @cached_property
@@ -74,7 +73,6 @@ class LabRobot(Robot):
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
-        """Position targets."""
         return {f"{joint}.pos": float for joint in self.world.joints}
 
     @property
@@ -84,7 +82,6 @@ class LabRobot(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """It is."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:

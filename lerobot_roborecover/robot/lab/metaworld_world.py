@@ -38,7 +38,6 @@ class MetaworldWorld:
         self._shift_px = np.zeros(2)
 
     def reset(self, task: str, seed: int) -> None:
-        """Lays out a new scene."""
         if task not in self.tasks:
             raise ScenarioError(f"--robot.task={task!r:.40}: Meta-World has no task of that name")
         self._simulator.reset(Task("metaworld", "metaworld", task, self.tasks[task], 500), Reset(seed=seed))
@@ -66,7 +65,6 @@ class MetaworldWorld:
         return cv2.warpAffine(picture, matrix, picture.shape[:2], borderMode=cv2.BORDER_REFLECT)
 
     def bump(self, camera: str, shift_px: tuple[float, float]) -> None:
-        """Moves the camera."""
         self._shift_px = np.array(shift_px, float)
 
     def succeeded(self) -> bool:
@@ -111,7 +109,6 @@ class MetaworldWorld:
         return max(gaps, default=0.0)
 
     def close(self) -> None:
-        """Frees the simulator."""
         self._simulator.close()
 
 

@@ -30,7 +30,6 @@ class LabPusherPolicy(PreTrainedPolicy):
         self.anchor = torch.nn.Parameter(torch.zeros(1), requires_grad=False)
 
     def get_optim_params(self) -> dict:
-        """None."""
         return {}
 
     def reset(self) -> None:

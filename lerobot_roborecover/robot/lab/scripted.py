@@ -45,7 +45,6 @@ def save_scripted(folder: Path, size: int = 96, bias_mm: float = 0.0, goal_x_mm:
 
 
 def main() -> None:
-    """Writes a checkpoint."""
     parser = argparse.ArgumentParser(description="Write a checkpoint of the simulated lab's scripted policy.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--size", type=int, default=96, help="of the lab's pictures (96)")

@@ -100,7 +100,6 @@ class TableWorld:
         self._task = ""
 
     def reset(self, task: str, seed: int) -> None:
-        """Lays out a new scene."""
         if task not in self.tasks:
             raise ScenarioError(f"--robot.task={task!r:.40}: the table has {', '.join(self.tasks)}")
         self._task = task
@@ -122,7 +121,6 @@ class TableWorld:
         return self._cameras[camera].picture(hand, puck)
 
     def bump(self, camera: str, shift_px: tuple[float, float]) -> None:
-        """Moves a camera."""
         self._cameras[camera].shift_px = np.asarray(shift_px, float)
 
     def succeeded(self) -> bool:
@@ -148,11 +146,9 @@ class TableWorld:
         self._set_puck(np.array(truth["puck"]) + offset_m)
 
     def distance_m(self, truth: Truth) -> float:
-        """Of the puck."""
         return float(np.linalg.norm(np.subtract(self.truth()["puck"], truth["puck"])))
 
     def close(self) -> None:
-        """Nothing to free."""
         self._simulator.close()
 
     def _set_puck(self, position_m: np.ndarray) -> None:

@@ -221,7 +221,6 @@ class Phone:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the server."""
         self._server.should_exit = True
         self._thread.join(5.0)
         self._listener.close()

@@ -260,7 +260,6 @@ class Handlers:
 
 
 def make_app(study: AnnotationStudy) -> Starlette:
-    """The application."""
     handlers = Handlers(study)
     routes = [
         Route("/{annotator}/", handlers.page),

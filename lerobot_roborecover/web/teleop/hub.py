@@ -52,7 +52,6 @@ class Hub:
     # --- the simulator's thread
 
     def publish(self, status: dict[str, Any]) -> None:
-        """Takes the latest status."""
         self._call(self._take_status, status)
 
     def show(self, step: int, frames: Mapping[str, bytes], taken: int = 0, scene: int = 0) -> None:

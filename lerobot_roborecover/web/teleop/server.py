@@ -41,8 +41,6 @@ class TeleopApp:
 
 
 def make_app(cockpit: TeleopApp) -> Any:
-    """The application."""
-
     async def page(request: Request) -> Response:
         check_token(request, NAME, cockpit.token, "roborecover curate teleop")
         if "token" in request.query_params:
@@ -87,7 +85,6 @@ class _Connection:
         self._loop = asyncio.get_running_loop()
 
     async def run(self) -> None:
-        """Until it ends."""
         await self._socket.accept()
         viewer = self._hub.join(self._socket.query_params.get("pictures") != "0")
         if viewer is None:

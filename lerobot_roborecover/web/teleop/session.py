@@ -186,7 +186,6 @@ class TeleopSession:
         return self.mark is not None and not self.lacks()
 
     def lacks(self) -> str:
-        """See `lacking`."""
         mark = None if self.mark is None else self.mark.step
         return lacking(mark, np.array(self.solved), self._start.task.horizon)
 

@@ -96,7 +96,6 @@ class SimulatorThread(threading.Thread):
         self._broken = ""
 
     def run(self) -> None:
-        """Runs until `stop`."""
         try:
             simulator = self._make()
             self._session = TeleopSession(simulator, self._operator)

@@ -104,7 +104,6 @@ class SpaceMouse(threading.Thread):
         self._stopped = threading.Event()
 
     def run(self) -> None:
-        """Until `stop`."""
         reports = Reports()
         while not self._stopped.is_set():
             try:
@@ -130,7 +129,6 @@ class SpaceMouse(threading.Thread):
             self._device.close()
 
     def stop(self) -> None:
-        """Ends the thread."""
         self._stopped.set()
         self.join()
 

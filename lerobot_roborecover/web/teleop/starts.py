@@ -36,7 +36,6 @@ class StartPoint:
 
     @property
     def label(self) -> str:
-        """For people."""
         place = f"seed {self.reset.seed}"
         if self.reset.init_state_index is not None:
             place = f"init state {self.reset.init_state_index}"

@@ -51,7 +51,6 @@ class Recorded:
 
     @property
     def rollout(self) -> Rollout:
-        """What is replayed."""
         return Rollout(self.task, self.reset, self.actions)
 
 
@@ -104,7 +103,6 @@ class Store:
         return sorted((int(match[1]), path) for match, path in found if match)
 
     def next_number(self) -> int:
-        """Of the next recording."""
         return max((number for number, _ in self._numbered()), default=0) + 1
 
     def add(self, recorded: Recorded, number: int) -> Path:
@@ -122,7 +120,6 @@ class Store:
         return path
 
     def close(self) -> None:
-        """Lets go of the folder."""
         self._lock.close()
 
 

@@ -155,7 +155,6 @@ class MonitorRewardModel(PreTrainedRewardModel):
             (save_directory / TRAINED_ON_FILE).write_text(json.dumps(self.trained_on, indent=1) + "\n")
 
     def save_weights(self, folder: Path) -> None:
-        """Writes the weights."""
         raise NotImplementedError
 
     def push_model_to_hub(self, cfg: TrainPipelineConfig, **_: Any) -> None:
@@ -182,7 +181,6 @@ class MonitorRewardModel(PreTrainedRewardModel):
         logger.info("Model pushed to %s", commit.repo_url.url)
 
     def card(self, dataset: str) -> str:
-        """The model card."""
         tags = sorted({*(self.config.tags or ()), "robotics", "lerobot", "reward-model", "roborecover"})
         head = ["---", f"license: {self.config.license or 'apache-2.0'}", "library_name: lerobot"]
         head += ["pipeline_tag: robotics", "tags:", *(f"- {t}" for t in [*tags, self.config.type])]

@@ -83,7 +83,6 @@ class RoboRecoverMonitorConfig(RewardModelConfig):
         return key.startswith("observation.") and feature.type is FeatureType.VISUAL
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """AdamW."""
         return AdamWConfig(
             lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm
         )

@@ -62,7 +62,6 @@ class RoboRecoverMonitorSmallConfig(RewardModelConfig):
         )  # fmt: skip
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """AdamW."""
         return AdamWConfig(
             lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm
         )
