@@ -81,7 +81,10 @@ def _make(parent: Path, prefix: str) -> tuple[Path, int]:
     """Makes a folder; returns it and the descriptor that holds its lock."""
     while True:
         path = Path(tempfile.mkdtemp(SUFFIX, prefix, parent))
-        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:
+            continue  # another process took it for abandoned before it was opened
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
         except OSError:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 
 import pytest
 
@@ -67,6 +68,22 @@ def test_a_folder_that_another_process_took_for_abandoned_is_made_anew(temporary
     monkeypatch.setattr(fcntl, "flock", late)
     with TemporaryFolder("late") as folder:
         assert folder.is_dir()
+
+
+def test_a_folder_that_is_gone_before_it_is_opened_is_made_anew(temporary, monkeypatch):
+    make, taken = tempfile.mkdtemp, []
+
+    def early(*args):
+        path = make(*args)
+        if not taken:  # another process looks between the making of the folder and its opening
+            taken.append(path)
+            assert len(remove_abandoned(temporary)) == 1
+        return path
+
+    monkeypatch.setattr(tempfile, "mkdtemp", early)
+    with TemporaryFolder("early") as folder:
+        assert folder.is_dir()
+        assert str(folder) != taken[0]
 
 
 def test_without_locks_nothing_counts_as_abandoned(temporary, monkeypatch):
