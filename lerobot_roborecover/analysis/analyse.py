@@ -107,7 +107,7 @@ def _initial_remarks(direct: Sequence[Arm], initial: Sequence[Arm]) -> list[str]
 
 
 def _intervenes(arm: Arm, options: Options) -> bool:
-    return arm.policy in options.interventions or any(row.interventions for row in arm.rows)
+    return arm.policy in options.interventions or arm.intervenes
 
 
 def _pair(

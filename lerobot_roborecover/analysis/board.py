@@ -140,7 +140,7 @@ def make_board(
     rsr, macro = draws.rates(panel.rates.T), macro_estimates(panel, draws)
     macro9 = macro_9_estimates(panel, draws)
     run = (panel.trials > 0).sum(1)
-    acting = [any(r.interventions for r in arm.rows) for arm in arms]
+    acting = [arm.intervenes for arm in arms]
     lacking = [a.missing.words if options.scheduled is None else a.missing.scenarios for a in arms]
     ranked = [
         p

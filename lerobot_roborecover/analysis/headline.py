@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,20 +16,32 @@ from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING, Compari
 from lerobot_roborecover.utils.text import pluralize
 
 
+@dataclass(frozen=True)
+class Headline:
+    """The result in a few sentences."""
+
+    claim: str
+    """How good, how sure, and against whom."""
+    limits: tuple[str, ...] = ()
+    """What limits it, a sentence each."""
+
+
 def headline(results: Results) -> str:
     """The result in a few sentences, every claim by `verdicts.py`."""
+    found = headline_of(results)
+    return " ".join((found.claim, *found.limits))
+
+
+def headline_of(results: Results) -> Headline:
+    """The claim, and what limits it; every claim by `verdicts.py`."""
     trials = valid_trials(results.ranked)
     valid = [p for p in results.best_first if trials[p]]
     if not valid:
         every = range(len(results.ranked.arms))
-        return f"No trial was valid {invalid_words(results.ranked, every)}."
+        return Headline(f"No trial was valid {invalid_words(results.ranked, every)}.")
     best = valid[0]
     name, rate = results.ranked.arms[best], results.ranked_rates[best]
-    sentences = [
-        f"{name} recovers in {100 * rate.value:.1f} % of its trials, averaged over scenarios"
-        + _intervals(results, best, rate)
-        + "."
-    ]
+    sentences: list[str] = []
     reached = masked_mean(results.ranked.reached_rates[best][:, None])[0]
     lost = int(results.ranked.by_infrastructure[best].sum())
     if lost and not math.isnan(reached):
@@ -55,10 +68,14 @@ def headline(results: Results) -> str:
             "Its rate is biased, and no verdict rests on it: its trial counts go with its outcomes. Evaluate "
             "every scenario the same number of times."
         )
+    claim = (
+        f"{name} recovers in {100 * rate.value:.1f} % of its trials, averaged over scenarios"
+        f"{_intervals(results, best, rate)}."
+    )
     rivals = [results.ranked.arms[p] for p in valid[1:]]
     if rivals and results.judged and name not in results.barred:
-        sentences.append(_standing(name, [results.contrast(name, rival) for rival in rivals]))
-    return " ".join(sentences)
+        claim += f" {_standing(name, [results.contrast(name, rival) for rival in rivals])}"
+    return Headline(claim, tuple(sentences))
 
 
 def _method(results: Results, name: str) -> str:

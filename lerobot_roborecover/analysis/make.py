@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -135,5 +136,13 @@ def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[
     for text in gallery.videos:
         name, rest = split_named(text)
         folders.append((name, Path(rest)))
+    if not folders:  # `eval` leaves its videos beside its log
+        beside = [(name, log.parent / "videos") for name, log in study.files.items()]
+        owners = Counter(folder for _, folder in beside)  # the files' names do not tell policies apart
+        folders = [
+            (name, folder)
+            for name, folder in beside
+            if folder.is_dir() and owners[folder] == 1 and name in panel.arms
+        ]
     clips, skipped = find_clips(folders, ids, gallery.videos_mb * 2**20)
     return frames, clips, remarks + skipped

@@ -73,6 +73,6 @@ class Gallery:
     render: bool = False
     """Render recovery frames that the set does not hold (runs the simulator)."""
     videos: Sequence[str] = option((), metavar="[NAME=]DIR")
-    """Videos of lerobot-eval for the gallery, named after the policy; may be given again."""
+    """Videos of a policy, named after it; may be given again (default: `videos/` beside each log)."""
     videos_mb: int = 64
     """Take in at most so many megabytes of video."""

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from lerobot_roborecover.analysis.escape import csv_text, latex, markdown
@@ -17,6 +17,10 @@ Kind = Literal["text", "percent", "points", "ratio", "count", "number", "p"]
 Cell = str | int | float | Estimate | None
 """None is an empty cell; NaN is an undefined number and is shown as n/a with a note."""
 
+LATEX_COLUMNS = 6
+"""Columns of a LaTeX table, at most: more do not fit a paper of two columns."""
+LATEX_CHARACTERS = 46
+"""Of a row that fits one column of such a paper, in small print."""
 NOT_DEFINED = "n/a"
 UNDEFINED_NOTE = (
     f"{NOT_DEFINED}: not defined, because there are no such trials, fewer than two scenarios to "
@@ -56,6 +60,25 @@ class Table:
                     f"table {self.name}: a row has {len(row)} cells for {len(self.columns)} columns"
                 )
 
+    def shown(self) -> Table:
+        """Returns the table for readers: without columns that are undefined in every row, which a note names.
+        CSV and JSON have all columns."""
+        empty = [
+            i
+            for i in range(1, len(self.columns))
+            if self.rows and all(_undefined(row[i]) for row in self.rows)
+        ]
+        if not empty:
+            return self
+        names = ", ".join(self.columns[i].title for i in empty)
+        keep = [i for i in range(len(self.columns)) if i not in empty]
+        return replace(
+            self,
+            columns=tuple(self.columns[i] for i in keep),
+            rows=tuple(tuple(row[i] for i in keep) for row in self.rows),
+            notes=(*self.notes, f"Not shown, because not defined here: {names}."),
+        )
+
     def all_notes(self) -> list[str]:
         """Its own notes and those that its values call for."""
         notes = list(self.notes)
@@ -72,6 +95,11 @@ class Table:
             if index in self.sparse:
                 cells[0] += SPARSE_MARK
             yield cells
+
+
+def _undefined(value: Cell) -> bool:
+    number = value.value if isinstance(value, Estimate) else value
+    return isinstance(number, float) and math.isnan(number)
 
 
 def cell_text(value: Cell, column: Column) -> str:
@@ -106,6 +134,7 @@ def _number(value: float, kind: Kind) -> str:
 
 def to_markdown(table: Table) -> str:
     """GitHub-flavoured Markdown: heading, table, notes."""
+    table = table.shown()
     head = [column.title for column in table.columns]
     rule = ["---" if column.kind == "text" else "---:" for column in table.columns]
     lines = [f"## {markdown(table.title, cell=True)}", ""]
@@ -147,31 +176,38 @@ def _csv_number(value: float) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A `table` environment with booktabs rules."""
-    shape = "".join("l" if column.kind == "text" else "r" for column in table.columns)
-    rows = [" & ".join(latex(cell) for cell in row) + r" \\" for row in table.texts()]
-    head = " & ".join(latex(column.title) for column in table.columns) + r" \\"
+    """A float with booktabs rules: blocks of at most `LATEX_COLUMNS` columns below each other, each with the
+    first column, in a paper's one column where they fit and across both where they do not."""
+    table = table.shown()
+    rest = range(1, len(table.columns))
+    blocks = [rest[k : k + LATEX_COLUMNS - 1] for k in range(0, len(rest), LATEX_COLUMNS - 1)] or [rest]
+    texts = [[column.title for column in table.columns], *table.texts()]
+    widths = [max(len(row[i]) for row in texts[1:] or texts) for i in range(len(table.columns))]
+    wide = max(widths[0] + sum(widths[i] + 2 for i in block) for block in blocks) > LATEX_CHARACTERS
+    environment = "table*" if wide else "table"
     caption = " ".join([f"{table.title}.", *table.all_notes()])
     lines = [
-        r"\begin{table}[t]",
+        rf"\begin{{{environment}}}[t]",
         r"\centering",
         r"\small",
-        rf"\begin{{tabular}}{{{shape}}}",
-        r"\toprule",
-        head,
-        r"\midrule",
-        *rows,
-        r"\bottomrule",
-        r"\end{tabular}",
+        "\n\\par\\medskip\n".join(_latex_block(table, texts, (0, *block)) for block in blocks),
         rf"\caption{{{latex(caption)}}}",
         rf"\label{{tab:roborecover-{table.name.replace('_', '-')}}}",
-        r"\end{table}",
+        rf"\end{{{environment}}}",
     ]
     return "\n".join(lines) + "\n"
 
 
+def _latex_block(table: Table, texts: Sequence[Sequence[str]], columns: Sequence[int]) -> str:
+    shape = "".join("l" if table.columns[i].kind == "text" else "r" for i in columns)
+    head, *rows = [" & ".join(latex(row[i]) for i in columns) + r" \\" for row in texts]
+    rules = r"\toprule", head, r"\midrule", *rows, r"\bottomrule"
+    return "\n".join((rf"\begin{{tabular}}{{{shape}}}", *rules, r"\end{tabular}"))
+
+
 def to_text(table: Table) -> str:
     """Plain text for a terminal: aligned columns and notes."""
+    table = table.shown()
     rows = [[column.title for column in table.columns], *table.texts()]
     widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
     return "\n".join(_aligned(row, widths, table.columns) for row in rows) + "".join(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.logs.row import EvalProtocol, make_row
-from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.scenario import Outcome, ScenarioError, Start
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from recipes.study.arms import StudyArm, arms
 from recipes.study.definition import StudyDefinition
@@ -53,10 +53,13 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
                 "scenarios; it was stored by another version of it. Run the study without "
                 "--use-stored-outcomes"
             )
-        arm = names[label]
+        arm, scenario = names[label], scenarios[scenario_id]
+        options = dict(study.env)
+        if arm.name in study.interventions:
+            options["intervention"] = arm.name
         row = make_row(
-            scenarios[scenario_id],
-            EvalProtocol(arm.start, 0, arm.name, None, None, options=dict(study.env)),
+            scenario,
+            EvalProtocol(arm.start, 0, arm.name, None, None, options=options),
             dataset=study.root.name,
             dataset_revision=None,
             trial=trial,
@@ -70,6 +73,8 @@ def write_stored_logs(study: StudyDefinition, out: Path) -> list[StudyArm]:
             policy_s=0.0,
             actions_sha256="",
         )
+        if arm.start == Start.RECOVERY:
+            row = replace(row, handoff_step=len(scenario.prefix))
         by_label[label].append(json.dumps(asdict(row)))
     for arm in found:
         atomic_write(arm.log, "".join(f"{line}\n" for line in by_label[arm.label]))

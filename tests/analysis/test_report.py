@@ -79,7 +79,7 @@ def test_everything_is_written(written):
     figures = {path.name for path in (out / "figures").iterdir()}
     stems = {
         "forest",
-        "rank_transition",
+        "slope",
         "cells",
         "source_matrix",
         "paired_differences",
@@ -257,7 +257,10 @@ def test_no_valid_trial(tmp_path):
     row = by_policy(table(results, "overall"))["alpha@1"]
     assert (row["RSR %"].value, row["Invalid"]) == (0, 3)
     assert np.isnan(row["RSR % without invalid"])
-    assert "n/a" in to_markdown(table(results, "overall"))
+    found = table(results, "overall")
+    assert "not defined here: Initial state %" in to_markdown(found)
+    assert "RSR % without invalid" in to_markdown(found).splitlines()[-1]
+    assert "n/a" in to_csv(found)
 
 
 HOLES = {
@@ -369,7 +372,7 @@ def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     policy = re.search('http-equiv="Content-Security-Policy" content="([^"]+)"', page)[1]
     assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} <= set(policy.split("; "))
     assert page.count('<li class="card"') == 6
-    assert page.count("data:video/mp4;base64,dmlkZW8=") == 1
+    assert page.count("data:video/mp4;base64,dmlkZW8=") == 2, "on the first screen and on its card"
     other = fake_dataset(tmp_path / "other", 3)
     assert main(["report", str(runs), f"--out={out}", f"--scenarios={other}"]) == 2
     assert "3 scenario(s) that" in capsys.readouterr().err

@@ -73,7 +73,7 @@ def test_every_figure_is_drawn(page):
     page.evaluate("document.querySelectorAll('#cards img').forEach(image => image.loading = 'eager')")
     page.evaluate("Promise.all(Array.from(document.images).map(image => image.decode()))")
     sizes = page.eval_on_selector_all("img", "images => images.map(i => [i.naturalWidth, i.alt.length])")
-    assert len(sizes) == 8 + COUNT // 2, "figures and frames"
+    assert len(sizes) == 9 + COUNT // 2, "figures and frames"
     assert all(width > 50 and words > 10 for width, words in sizes)
     assert page.locator("table").count() >= 10
 
@@ -144,7 +144,8 @@ def test_scroll_areas_links_and_marks_are_reachable(page):
     assert all(page.locator(f"section#{anchor}").count() == 1 for anchor in anchors)
     words = page.locator("li[data-id=s001] dd .hidden-text").all_text_contents()
     assert any("sim error, <b>died</b>" in text for text in words)
-    assert page.get_attribute("li[data-id=s003] video", "aria-label") == "alpha@1 on s003, first trial"
+    label = page.get_attribute("li[data-id=s003] video", "aria-label")
+    assert label == "alpha@1 on s003, trial 1, not solved"
 
 
 def test_a_narrow_window_does_not_scroll_sideways(page):
@@ -169,7 +170,9 @@ def test_figures_for_a_phone_are_other_drawings(page):
         page.evaluate("Promise.all(Array.from(document.querySelectorAll('figure img'), i => i.decode()))")
         return page.eval_on_selector_all("figure img", "images => images.map(i => i.naturalWidth)")
 
-    assert min(widths()) > 900
+    first, *others = widths()
+    assert min(others) > 900
+    assert 600 < first < 800, "half a page, beside the video"
     page.set_viewport_size({"width": 390, "height": 844})
     try:
         assert max(widths()) < 400
@@ -190,9 +193,34 @@ def test_a_dark_screen_gets_a_dark_page(page):
     assert brightness[1][0] < brightness[1][1]
 
 
+@pytest.mark.parametrize("width", [375, 1400])
+def test_the_first_screen_answers_and_nothing_is_cut(page, width):
+    """Sentence, slope graph and video come before the navigation; the page does not scroll sideways."""
+    page.set_viewport_size({"width": width, "height": 900})
+    try:
+        assert page.is_visible("header .lead")
+        assert (
+            page.locator("header .first img")
+            .get_attribute("alt")
+            .startswith("Success in per cent from initial")
+        )
+        assert page.locator("header .pair video").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate("document.querySelector('nav ul').scrollWidth") <= width
+        page.evaluate("document.querySelectorAll('details').forEach(fold => fold.open = true)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        if width == 1400:
+            cut = "areas => areas.filter(a => a.scrollWidth > a.clientWidth).map(a => a.innerText)"
+            assert page.eval_on_selector_all(".scroll", cut) == []
+    finally:
+        page.set_viewport_size({"width": 1200, "height": 900})
+
+
 def test_a_table_that_goes_on_says_so_and_keeps_its_first_column(page):
     page.set_viewport_size({"width": 390, "height": 844})
     try:
+        assert not page.is_visible("#t-overall"), "tables are folded"
+        page.click("details.tables:has(#t-overall) > summary")
         area = page.locator(".scroll:has(#t-overall)")
         assert page.is_visible(".table:has(#t-overall) .hint")
         assert "columns" in page.text_content(".table:has(#t-overall) .hint")

@@ -69,11 +69,12 @@ def test_media_are_found_by_their_commands_names(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     found = find_media(tmp_path, [f"s{n}" for n in range(1, 7)])
-    assert {i: str(p.relative_to(tmp_path)) for i, p in found.items()} == {
-        "s1": "libero_goal_s1/eval_episode_0.mp4",
-        "s2": "s2_trial0_success.mp4",
-        "s3": "s3/replay.rrd",
-        "s4": "s4.mp4",
+    names = {i: [(trial, str(p.relative_to(tmp_path))) for trial, p in media] for i, media in found.items()}
+    assert names == {
+        "s1": [(0, "libero_goal_s1/eval_episode_0.mp4")],
+        "s2": [(0, "s2_trial0_success.mp4"), (1, "s2_trial1_horizon.mp4")],
+        "s3": [(0, "s3/replay.rrd")],
+        "s4": [(0, "s4.mp4")],
     }
     with pytest.raises(RowsError, match="no folder of videos"):
         find_media(tmp_path / "none", ["s1"])

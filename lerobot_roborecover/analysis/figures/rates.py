@@ -1,4 +1,4 @@
-"""Figures of rates: forest, rank transition, cells, source × recovery, paired differences."""
+"""Figures of rates: forest, cells, source × recovery, paired differences."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.figures.retries import retries
 from lerobot_roborecover.analysis.figures.runs import runs_figure
+from lerobot_roborecover.analysis.figures.slope import slope
 from lerobot_roborecover.analysis.figures.style import (
     HEAT,
     INK,
@@ -43,8 +44,8 @@ def all_figures(results: Results) -> list[Figure]:
     if results.several_runs:
         figures.append(runs_figure(results))
     several = len(results.recovery.arms) > 1
-    if len(results.matched) > 1:
-        figures.append(rank_transition(results))
+    if (found := slope(results)) is not None:
+        figures.append(found)
     figures.append(cell_heat_map(results))
     if matrix := source_matrix(results.recovery, results.draws):
         figures.append(source_heat_map(results, matrix))
@@ -80,14 +81,14 @@ def forest(results: Results) -> Figure:
                 if not math.isnan(rsr[p].low):
                     axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=colour(p), lw=3)
                 axes.plot(100 * rsr[p].value, y, marker(p), color=colour(p), ms=9, mec=PAPER, mew=1)
-                value = f"{100 * rsr[p].value:.1f}"
-                if width.narrow:
-                    place = {"xycoords": ("axes fraction", "data"), "ha": "right"}
-                    axes.annotate(value, (1, y), (0, 9), textcoords="offset points", fontsize=9.5, **place)
-                else:
+                if not width.narrow:
                     at = 100 * rsr[p].value, y
+                    value = f"{100 * rsr[p].value:.1f}"
                     axes.annotate(value, at, (0, 8), textcoords="offset points", ha="center", fontsize=9)
-            name_rows(axes, [short(panel.arms[p], width.names) for p in order], width)
+            names = [short(panel.arms[p], width.names) for p in order]
+            if width.narrow:  # beside the name: above the row's end the value would be read as another mark's
+                names = [f"{name}  {100 * rsr[p].value:.1f}" for name, p in zip(names, order, strict=True)]
+            name_rows(axes, names, width)
             axes.set(xlim=(-1, 101), ylim=(-0.6, len(order) - 0.15))
             hollow = any(not math.isnan(e.value) for e in initial)
             texts = [f"RSR, %, with {level}", "hollow: from initial states"][: 1 + hollow]
@@ -108,43 +109,6 @@ def _words(estimate: Estimate) -> str:
     if math.isnan(estimate.low):
         return f"{100 * estimate.value:.1f}"
     return f"{100 * estimate.value:.1f} ({100 * estimate.low:.1f} to {100 * estimate.high:.1f})"
-
-
-def rank_transition(results: Results) -> Figure:
-    """Ranks from initial states against ranks at recovery."""
-    index = results.matched
-    first, second = results.both_starts
-    names, initial, recovery = first.policies, first.means, second.means
-    left, right = _ranks(initial), _ranks(recovery)
-
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
-            plot, axes = subplots(width.inches, 0.7 + 0.42 * len(index))
-            for k, p in enumerate(index):
-                axes.plot([0, 1], [left[k], right[k]], marker(p), ls="-", color=colour(p), lw=2.2, ms=8.5)
-                name = short(names[k], 12 if width.narrow else width.names)
-                gap = 0.1 if width.narrow else 0.04
-                before = f"{100 * initial[k]:.1f}" if width.narrow else f"{name}   {100 * initial[k]:.1f}"
-                axes.text(-gap, left[k], before, ha="right", va="center")
-                axes.text(1 + gap, right[k], f"{100 * recovery[k]:.1f}   {name}", ha="left", va="center")
-            axes.set(
-                xlim=(-0.45, 1.95) if width.narrow else (-0.75, 1.75), ylim=(len(index) + 0.5, 0.5),
-                xticks=[0, 1], xticklabels=["initial state, %", "recovery, %"], yticks=[],
-            )  # fmt: skip
-            axes.spines[:].set_visible(False)
-            axes.tick_params(length=0, labelcolor=SOFT)
-        return plot
-
-    order = ", ".join(names[k] for k in np.argsort(left)), ", ".join(names[k] for k in np.argsort(right))
-    text = f"Order from initial states: {order[0]}. Order at recovery: {order[1]}."
-    return Figure("rank_transition", "From initial-state rank to recovery rank", text, *both(draw))
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    """1 is the highest; ties in the order given, so that no two labels overlap."""
-    ranks = np.empty(len(values))
-    ranks[np.argsort(-values, kind="stable")] = np.arange(1, len(values) + 1)
-    return ranks
 
 
 def cell_heat_map(results: Results) -> Figure:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,16 @@ class TrialVideo:
     policy: str
     uri: str
     """Data URI, or the file's path from the page."""
+    trial: int = 0
+    """Number of the trial, from 0."""
+    outcome: str = ""
+    """How the trial ended, by its log row; empty where no row of it is known."""
+
+    @property
+    def words(self) -> str:
+        """Which trial it shows, and how that ended."""
+        kind = "solved" if self.outcome == Outcome.SUCCESS else "not solved" if self.outcome else ""
+        return ", ".join(filter(None, (f"trial {self.trial + 1}", kind)))
 
     @property
     def recording(self) -> bool:
@@ -91,6 +102,7 @@ def make_cards(
         initial: trials of the same policies from initial states.
     """
     before = _initial_rows(initial)
+    numbers = {policy: p for p, policy in enumerate(panel.arms)}
     cards = []
     for n, scenario in enumerate(panel.scenarios):
         rates = panel.rates[:, n]
@@ -114,13 +126,49 @@ def make_cards(
                     )
                     for p in range(len(panel.arms))
                 ),
-                clips=tuple(clips.get(scenario.id, ())),
+                clips=tuple(
+                    _with_outcome(clip, panel.rows.get((numbers.get(clip.policy, -1), n), ()))
+                    for clip in clips.get(scenario.id, ())
+                ),
                 outcome_classes=_classes(run, bool(panel.invalid[:, n].any())),
                 disagreement=float(run.std()),
                 rate=float(run.mean()),
             )
         )
     return sorted(cards, key=lambda card: (-card.disagreement, card.id))
+
+
+def _with_outcome(clip: TrialVideo, rows: Sequence[TrialRow]) -> TrialVideo:
+    return replace(clip, outcome=next((row.outcome for row in rows if row.trial == clip.trial), ""))
+
+
+@dataclass(frozen=True)
+class PairedVideo:
+    """One or two videos from one recovery point."""
+
+    card: Card
+    clips: tuple[TrialVideo, ...]
+
+
+def choose_pair(cards: Sequence[Card]) -> PairedVideo | None:
+    """Two videos of one scenario for the first screen: of two policies, or of two trials.
+
+    Preferred are two that ended differently, then two policies, then the order of the cards.
+
+    Args:
+        cards: of `make_cards`.
+
+    Returns:
+        Two videos; one where no scenario has two; None without any.
+    """
+    found: list[tuple[tuple[int, bool, bool], PairedVideo]] = []
+    for card in cards:
+        shown = [clip for clip in card.clips if not clip.recording]
+        for pair in [*combinations(shown, 2), *((clip,) for clip in shown[:1])]:
+            ends, names = {c.outcome == Outcome.SUCCESS for c in pair}, {c.policy for c in pair}
+            score = (len(pair), len(ends) > 1 and all(c.outcome for c in pair), len(names) > 1)
+            found.append((score, PairedVideo(card, pair)))
+    return max(found, key=lambda item: item[0])[1] if found else None
 
 
 def _classes(rates: np.ndarray, invalid: bool) -> tuple[str, ...]:
@@ -202,7 +250,7 @@ def check_scenarios(trials: Iterable[TrialRow], scenarios: Sequence[Scenario], n
         name: what to call it.
 
     Returns:
-        Remarks: scenarios of the set without any trial.
+        Remarks: scenarios without any trial, of the splits that have trials.
 
     Raises:
         RowsError: a row's scenario is not in the set, or is another one of the same name.
@@ -223,5 +271,7 @@ def check_scenarios(trials: Iterable[TrialRow], scenarios: Sequence[Scenario], n
             "set was changed "
             "after the evaluation. Name the revision that was evaluated"
         )
-    idle = sorted(set(known) - set(rows))
-    return [f"{len(idle)} of {len(known)} scenarios of {name} have no trial, e.g. {idle[0]}"] if idle else []
+    splits = {row.split for row in rows.values()}
+    whole = {s.id for s in scenarios if s.labels.split in splits}  # a study of one split lacks no other
+    idle = sorted(whole - set(rows))
+    return [f"{len(idle)} of {len(whole)} scenarios of {name} have no trial, e.g. {idle[0]}"] if idle else []

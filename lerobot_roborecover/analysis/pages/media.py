@@ -12,11 +12,13 @@ from lerobot_roborecover.analysis.stats.estimators import RowsError
 
 _OF_A_FOLDER = ("eval_episode_0.mp4", "replay.rrd")
 """Files that are called alike for all scenarios: the folder names the scenario."""
+TRIALS_SHOWN = 2
+"""Of a policy on a scenario: two trials from one recovery point can be compared, more make a page heavy."""
 _TRIAL = re.compile(r"(?P<id>.+)_trial(?P<trial>\d+)(_\w+)?")
 
 
-def find_media(folder: Path, ids: Sequence[str]) -> dict[str, Path]:
-    """A video or recording of each scenario, the first trial's where there are several.
+def find_media(folder: Path, ids: Sequence[str]) -> dict[str, list[tuple[int, Path]]]:
+    """Videos and recordings of each scenario, with the numbers of their trials, in that order.
 
     Taken are `<group>_<scenario>/eval_episode_0.mp4` of `lerobot-eval`, `<scenario>_trial<k>_<outcome>.mp4`
     of `roborecover eval`, `<scenario>/replay.rrd` of `dataset inspect`, and `<scenario>.mp4` or `.rrd`.
@@ -44,10 +46,10 @@ def find_media(folder: Path, ids: Sequence[str]) -> dict[str, Path]:
         named.setdefault(name, []).append((trial, path))
     found = {}
     for scenario_id in ids:
-        mine = [path for name, path in grouped if name == scenario_id or name.endswith(f"_{scenario_id}")]
-        mine += [path for _, path in sorted(named.get(scenario_id, ()))]
+        mine = [(0, p) for name, p in grouped if name == scenario_id or name.endswith(f"_{scenario_id}")]
+        mine += sorted(named.get(scenario_id, ()))
         if mine:
-            found[scenario_id] = mine[0]
+            found[scenario_id] = mine
     return found
 
 
@@ -70,14 +72,16 @@ def find_clips(
     clips: dict[str, list[TrialVideo]] = {}
     used = skipped = 0
     for name, folder in folders:
-        for scenario_id, path in find_media(folder, ids).items():
+        found = find_media(folder, ids)
+        every = [(i, trial, path) for i, media in found.items() for trial, path in media[:TRIALS_SHOWN]]
+        for scenario_id, trial, path in every:
             size = path.stat().st_size
             if path.suffix != ".mp4" or used + size > limit_bytes:
                 skipped += 1
                 continue
             used += size
             data = base64.b64encode(path.read_bytes()).decode()
-            clips.setdefault(scenario_id, []).append(TrialVideo(name, f"data:video/mp4;base64,{data}"))
+            clips.setdefault(scenario_id, []).append(TrialVideo(name, f"data:video/mp4;base64,{data}", trial))
     if skipped:
         limit = f"all together exceed {limit_bytes // 2**20} MiB"
         return clips, [f"{skipped} video(s) are left out: {limit}, or are no .mp4"]

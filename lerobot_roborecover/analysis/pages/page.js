@@ -11,6 +11,11 @@
   for (const area of areas) {
     area.addEventListener("scroll", () => area.classList.toggle("beyond", area.scrollLeft > 0), { passive: true });
   }
+  // A folded table has no width yet; what is printed is unfolded.
+  for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", look);
+  addEventListener("beforeprint", () => {
+    for (const fold of document.querySelectorAll("details.tables")) fold.open = true;
+  });
   addEventListener("resize", look);
   look();
 })();

@@ -14,9 +14,21 @@ from lerobot_roborecover._version import __version__
 from lerobot_roborecover.analysis.escape import markdown, markdown_alt
 from lerobot_roborecover.analysis.figures.rates import all_figures
 from lerobot_roborecover.analysis.figures.style import png_of
-from lerobot_roborecover.analysis.headline import headline
-from lerobot_roborecover.analysis.pages.gallery import Card, TrialVideo, gallery_values, make_cards
-from lerobot_roborecover.analysis.pages.page import drawn_as_svg, grouped, picture, render_page
+from lerobot_roborecover.analysis.headline import headline, headline_of
+from lerobot_roborecover.analysis.pages.gallery import (
+    Card,
+    TrialVideo,
+    choose_pair,
+    gallery_values,
+    make_cards,
+)
+from lerobot_roborecover.analysis.pages.page import (
+    drawn_as_svg,
+    grouped,
+    picture,
+    render_page,
+    without_folders,
+)
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.intervals import Estimate
@@ -32,7 +44,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("overall", "forest", ("overall",)),
     ("starts", "", ("robot_starts", "robot_slopes")),
     ("runs", "runs", ("methods", "runs", "method_contrasts")),
-    ("ranks", "rank_transition", ("ranks", "inversions")),
+    ("ranks", "", ("ranks", "inversions")),
     ("differences", "paired_differences", ("contrasts", "profiles")),
     ("cells", "cells", ("cells", "sources", "suites")),
     ("sources", "source_matrix", ("source_matrix",)),
@@ -104,7 +116,7 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
     with claim_page(out, REPORT_FILES):
         extras = extras or Extras()
         tables = all_tables(results)
-        remarks = [*results.remarks, *extras.remarks]
+        remarks = [without_folders(remark) for remark in (*results.remarks, *extras.remarks)]
         images: dict[str, dict[str, str]] = {}
         for figure in all_figures(results):
             wide, narrow = drawn_as_svg(figure)
@@ -138,14 +150,20 @@ def provenance_of(results: Results, command: str = "") -> dict[str, Any]:
     return {
         "schema": REPORT_SCHEMA,
         "roborecover": __version__,
-        "command": command,
+        "command": without_folders(command),
         "logs": [
-            {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+            {
+                "path": without_folders(str(path.absolute())),
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            }
             for path in results.study.logs
         ],
         "platform": results.study.platform,
         "datasets": sorted(
-            {f"{r.dataset}@{r.dataset_revision}" if r.dataset_revision else r.dataset for r in rows}
+            {
+                without_folders(f"{r.dataset}@{r.dataset_revision}" if r.dataset_revision else r.dataset)
+                for r in rows
+            }
         ),
         "versions": versions,
         "trials_from": min(row.finished_at for row in rows),
@@ -226,26 +244,32 @@ def _html(
     extras: Extras,
 ) -> str:
     by_name = {table.name: table for table in tables}
+    heads = {arm.title for arm in results.study.arms}
+    heads |= {without_folders(str(path)) for path in results.study.logs}
+    found = headline_of(results)
+    first = next((name for name in ("slope", "forest") if name in images), "")
     sections = [
         {
             "anchor": anchor,
             "heading": _HEADINGS[anchor],
-            "figure": images.get(figure),
-            "tables": [by_name[name] for name in names if name in by_name],
+            "figure": images.get(figure) if figure != first else None,
+            "tables": [by_name[name].shown() for name in names if name in by_name],
         }
         for anchor, figure, names in _SECTIONS
         if figure in images or any(name in by_name for name in names)
     ]
-    heads = {arm.title for arm in results.study.arms} | {str(path) for path in results.study.logs}
     return render_page(
         "report.html.j2",
         title=extras.title,
         scripts=("gallery.js",),
-        headline=headline(results),
+        claim=found.claim,
+        limits=found.limits,
+        first=images.get(first),
+        pair=choose_pair(cards),
         introduction=extras.introduction,
         remarks=grouped(remarks, [*heads, *results.study.policies]),
         sections=sections,
         **gallery_values(cards),
-        commands=extras.commands,
+        commands=[without_folders(command) for command in extras.commands],
         provenance=json.dumps(provenance, indent=1),
     )

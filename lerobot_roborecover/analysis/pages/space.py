@@ -125,12 +125,12 @@ def _media(folders: Sequence[tuple[str, Path]], panel: Panel, out: Path) -> dict
         if policy not in panel.arms:
             continue
         name = re.sub(r"[^A-Za-z0-9]+", "-", policy).strip("-").lower()
-        for scenario_id, path in find_media(folder, ids).items():
+        for scenario_id, ((trial, path), *_) in find_media(folder, ids).items():
             target = f"media/{number}-{name}/{scenario_id}{path.suffix}"
             (out / target).parent.mkdir(parents=True, exist_ok=True)
             with atomic_file(out / target) as fresh:
                 shutil.copyfile(path, fresh)
-            clips.setdefault(scenario_id, []).append(TrialVideo(policy, target))
+            clips.setdefault(scenario_id, []).append(TrialVideo(policy, target, trial))
     return clips
 
 

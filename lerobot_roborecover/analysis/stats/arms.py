@@ -36,6 +36,13 @@ class Arm:
     """What it lacks of what its runs were to evaluate, as far as the rows say."""
 
     @property
+    def intervenes(self) -> bool:
+        """Whether its rows say that something intervened, or was there to do so."""
+        return any(
+            row.interventions or row.options.get("intervention", "direct") != "direct" for row in self.rows
+        )
+
+    @property
     def title(self) -> str:
         """Policy and, where it is not the recovery point, start."""
         if self.start is Start.REVERSION:

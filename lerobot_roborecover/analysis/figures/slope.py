@@ -1,0 +1,111 @@
+"""Slope graph: every policy's success from initial states, and from recovery points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_roborecover.analysis.figures.style import (
+    LINE,
+    SOFT,
+    Figure,
+    Plot,
+    Width,
+    both,
+    colour,
+    drawing,
+    marker,
+    short,
+)
+from lerobot_roborecover.analysis.policy_tables import initial_estimates
+from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.stats.intervals import Estimate
+
+MOST_POLICIES = 12
+"""Policies that the graph shows, the best at recovery first: more lines cannot be told apart."""
+_INCHES = 7.2
+"""Width for a page: it stands beside videos."""
+_APART = 5.2
+"""Per cent between two labels, so that they do not overlap."""
+
+
+def slope(results: Results) -> Figure | None:
+    """Initial against recovery success, with intervals; None where no ranked policy has both."""
+    chosen = results.compared.policies
+    rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
+    every = [chosen[p] for p in results.best_first if not math.isnan(initial[chosen[p]].value)]
+    if not every:
+        return None
+    shown = every[:MOST_POLICIES]
+    names = [results.recovery.arms[p] for p in shown]
+    ends = [[initial[p] for p in shown], [rsr[p] for p in shown]]
+
+    def draw(width: Width) -> Plot:
+        with drawing() as subplots:
+            plot, axes = subplots(width.inches if width.narrow else _INCHES, 4.2)
+            for p, name, before, after in zip(shown, names, *ends, strict=True):
+                values = [100 * before.value, 100 * after.value]
+                axes.plot([0, 1], values, marker(p), ls="-", color=colour(p), lw=2.4, ms=8.5, label=name)
+                for x, estimate in ((0, before), (1, after)):
+                    if not math.isnan(estimate.low):
+                        bounds = [100 * estimate.low, 100 * estimate.high]
+                        axes.plot([x, x], bounds, color=colour(p), lw=1.4, alpha=0.55)
+            gap = 0.07 if width.narrow else 0.03
+            limit = 15 if width.narrow else 22
+            places = [_spread_out([100 * e.value for e in end]) for end in ends]
+            for k, name in enumerate(names):
+                before, after = (f"{100 * end[k].value:.1f}" for end in ends)
+                left = before if width.narrow else f"{short(name, limit)}   {before}"
+                axes.text(-gap, places[0][k], left, ha="right", va="center", fontsize=9.5)
+                axes.text(1 + gap, places[1][k], f"{after}   {short(name, limit)}", va="center", fontsize=9.5)
+            every_place = np.concatenate(places)
+            axes.set(
+                xlim=(-0.3, 1.95) if width.narrow else (-0.85, 1.85),
+                ylim=(min(0, every_place.min() - 3), max(100, every_place.max() + 3)), xticks=[0, 1],
+                xticklabels=["initial states, %", "recovery points, %"],
+            )  # fmt: skip
+            axes.set_yticks([])
+            for x in (0, 1):
+                axes.axvline(x, color=LINE, lw=1, zorder=0)
+            axes.spines[:].set_visible(False)
+            axes.tick_params(length=0, labelcolor=SOFT)
+        return plot
+
+    return Figure(
+        "slope", "From initial states to recovery points", _words(names, ends, len(every)), *both(draw)
+    )
+
+
+def _words(names: Sequence[str], ends: Sequence[Sequence[Estimate]], count: int) -> str:
+    pairs = "; ".join(
+        f"{name} {100 * before.value:.1f} and {100 * after.value:.1f}"
+        for name, before, after in zip(names, *ends, strict=True)
+    )
+    text = (
+        f"Success in per cent from initial states and from recovery points, best at recovery first: {pairs}."
+    )
+    return text if count <= len(names) else f"{text} The best {len(names)} of {count} policies."
+
+
+def _spread_out(values: Sequence[float]) -> np.ndarray:
+    """Places for labels: the values themselves, moved apart where they would overlap, in their order."""
+    order = np.argsort(values, kind="stable")
+    places = np.array(values, float)[order]
+    groups = [[k] for k in range(len(places))]
+    centres = list(places)
+    k = 0
+    while k + 1 < len(groups):  # neighbours that overlap become one block around their mean
+        if centres[k + 1] - centres[k] < _APART * (len(groups[k]) + len(groups[k + 1])) / 2 - 1e-9:
+            groups[k] += groups.pop(k + 1)
+            centres.pop(k + 1)
+            centres[k] = float(places[groups[k]].mean())
+            k = max(k - 1, 0)
+        else:
+            k += 1
+    found = np.empty(len(places))
+    for members, centre in zip(groups, centres, strict=True):
+        for m, index in enumerate(members):
+            found[order[index]] = centre + _APART * (m - (len(members) - 1) / 2)
+    return found
