@@ -14,6 +14,9 @@ MAX_SEED = 2**63
 class RoboRecoverError(Exception):
     """Something cannot be used or done; the message is all that a user needs."""
 
+    exit_status = 2
+    """Of a command that ends with it."""
+
 
 class OptionError(RoboRecoverError, ValueError):
     """An option's value cannot be used; the message names it, the limit and the remedy."""

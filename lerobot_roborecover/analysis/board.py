@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -16,7 +17,7 @@ from lerobot_roborecover.analysis.stats.macro import MacroCells, cells_of, macro
 from lerobot_roborecover.analysis.stats.panel import Panel, make_panel
 from lerobot_roborecover.analysis.stats.resampling import resample
 from lerobot_roborecover.analysis.stats.runs import method_rate, run_rates
-from lerobot_roborecover.analysis.stats.soundness import barred_arms
+from lerobot_roborecover.analysis.stats.soundness import barred_arms, valid_trials
 from lerobot_roborecover.analysis.stats.units import WORDS
 from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.logs.row import TrialRow
@@ -50,6 +51,7 @@ class Entry:
 
     policy: str
     rsr: Estimate
+    """Undefined where no trial was valid, as are `macro`, `macro9` and `behind`."""
     macro: Estimate
     """Over the board's cells that are large enough, see `Board.cells`."""
     macro9: Estimate
@@ -142,10 +144,15 @@ def make_board(
     run = (panel.trials > 0).sum(1)
     acting = [arm.intervenes for arm in arms]
     lacking = [a.missing.words if options.scheduled is None else a.missing.scenarios for a in arms]
+    valid = valid_trials(panel)
     ranked = [
         p
         for p, arm in enumerate(arms)
-        if run[p] == len(panel.scenarios) and not acting[p] and not arm.unreached and not lacking[p]
+        if run[p] == len(panel.scenarios)
+        and valid[p]
+        and not acting[p]
+        and not arm.unreached
+        and not lacking[p]
     ]
     methods = [method_rate(run_rates(a, panel, p, options.scheduled), draws) for p, a in enumerate(arms)]
     best = max(ranked, key=lambda p: rsr[p].value) if ranked else None
@@ -164,13 +171,13 @@ def make_board(
         entries.append(
             Entry(
                 policy=e[0],
-                rsr=rsr[p],
-                macro=macro[p],
-                macro9=macro9[p],
+                rsr=rsr[p] if valid[p] else UNDEFINED,
+                macro=macro[p] if valid[p] else UNDEFINED,
+                macro9=macro9[p] if valid[p] else UNDEFINED,
                 initial=_initial(_arm(e, initial, Start.INITIAL, run_of), options)
                 if initial
                 else _undefined(),
-                behind=behind[p],
+                behind=behind[p] if valid[p] else UNDEFINED,
                 verdict=None if against is None else _of_the_best(against, against is between.get((best, p))),
                 place=_place(p, ranked, between) if p in ranked else None,
                 scenarios=int(run[p]),
@@ -186,9 +193,7 @@ def make_board(
             )
         )
     whole = len(panel.scenarios)
-    entries.sort(
-        key=lambda e: (e.interventions, e.scenarios < whole or bool(e.missing), -e.rsr.value, e.policy)
-    )
+    entries.sort(key=lambda e: _order(e, whole))
     name = f"{dataset}, {split}{kind}"
     digest = hashlib.sha256("\n".join(f"{i} {h}" for i, h in sorted(scenario_set)).encode()).hexdigest()[:12]
     board = Board(
@@ -249,6 +254,13 @@ def _provenance(rows: Sequence[TrialRow], logs: dict[str, None]) -> Provenance:
         tuple(sorted({r.config_hash for r in rows})),
         max(r.finished_at for r in rows),
     )
+
+
+def _order(entry: Entry, whole: int) -> tuple:
+    """Complete policies first, by rate; those without one after them."""
+    incomplete = entry.scenarios < whole or bool(entry.missing)
+    rate = entry.rsr.value
+    return entry.interventions, incomplete, math.isnan(rate), 0.0 if math.isnan(rate) else -rate, entry.policy
 
 
 def separated(entry: Entry) -> bool:

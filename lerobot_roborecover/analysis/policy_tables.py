@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.results import Results
@@ -16,6 +17,7 @@ from lerobot_roborecover.analysis.stats.macro import (
     percentile_macro,
 )
 from lerobot_roborecover.analysis.stats.resampling import masked_mean
+from lerobot_roborecover.analysis.stats.soundness import valid_trials
 from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
 from lerobot_roborecover.scenario import Outcome, Start
@@ -34,11 +36,16 @@ def overall(results: Results) -> Table:
     valid = masked_mean(panel.valid_rates.T)
     tasks = rsr if results.tasks is None else results.tasks.rates(panel.rates.T)
     paper, paper_macro = draws.percentile(panel.rates.T), percentile_macro(panel, draws, PAPER_CELLS)
+    measured = valid_trials(panel)
+
+    def of(estimates: Sequence[Estimate], p: int) -> Estimate:
+        return estimates[p] if measured[p] else UNDEFINED  # invalid trials alone say nothing about it
+
     rows = [
         (
-            policy, initial[p], rsr[p], *(found[p] for found in macro.values()), retention[p],
+            policy, initial[p], of(rsr, p), *(of(found, p) for found in macro.values()), retention[p],
             _scenarios(results, p), int(panel.trials[p].sum()), int(panel.invalid[p].sum()),
-            float(valid[p]), tasks[p], paper[p], paper_macro[p],
+            float(valid[p]), of(tasks, p), of(paper, p), of(paper_macro, p),
         )
         for p, policy in enumerate(panel.arms)
     ]  # fmt: skip

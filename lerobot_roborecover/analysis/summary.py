@@ -19,6 +19,7 @@ from lerobot_roborecover.analysis.stats.estimators import (
 from lerobot_roborecover.analysis.stats.intervals import (
     LEVEL,
     RARE,
+    UNDEFINED,
     Estimate,
     estimate_of,
     rate_interval,
@@ -77,6 +78,11 @@ class StartSummary:
     """Of the scenarios."""
     within: Mapping[int, Estimate]
     """RSR@k by k from 2, as far as every scenario has k trials; empty of initial-state trials."""
+
+    @property
+    def measured(self) -> bool:
+        """Whether any trial was valid: invalid trials alone say nothing about the policy."""
+        return sum(self.invalid.values()) < self.trials
 
 
 @dataclass(frozen=True)
@@ -189,7 +195,9 @@ def format_table(summary: Summary) -> str:
         if part is None:
             continue
         counts = f"{part.scenarios:>10}{part.trials:>8}{sum(part.invalid.values()):>9}"
-        lines.append(f"{title:<26}{_rate(part.rsr)}{counts}")
+        lines.append(f"{title:<26}{_rate(part.rsr if part.measured else UNDEFINED)}{counts}")
+        if not part.measured:
+            continue
         lines += [f"{f'  within {k} attempts':<26}{_rate(found)}" for k, found in part.within.items()]
         if start is not Start.INITIAL:
             cells = part.macro_cells
@@ -197,7 +205,7 @@ def format_table(summary: Summary) -> str:
                 lines.append(f"{cells.title:<26}{_rate(part.macro)}")
             lines.append(f"{MACRO_9:<26}{_rate(part.macro9)}")
     recovery = summary.starts.get(Start.RECOVERY)
-    if recovery is not None:
+    if recovery is not None and recovery.measured:
         lines += ["", "Recovery by cell"]
         for cell in recovery.cells:
             name = f"{cell.cell} *" if cell.underpowered else cell.cell
@@ -214,6 +222,9 @@ def format_table(summary: Summary) -> str:
     for start, part in summary.starts.items():
         if part.invalid:
             reasons = ", ".join(f"{count} {name}" for name, count in part.invalid.items())
+            if not part.measured:
+                lines.append(f"\nNo rate from {start.value} starts: every trial was invalid: {reasons}")
+                continue
             lines.append(f"\nInvalid trials from {start.value} starts, counted as failures: {reasons}")
         if part.without_infrastructure is not None:
             rate = _rate(part.without_infrastructure).strip()

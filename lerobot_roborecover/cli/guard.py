@@ -19,8 +19,8 @@ def guarded(name: str, work: Callable[[], int]) -> int:
         work: the command; returns its exit status.
 
     Returns:
-        Exit status: the command's own; 2 refused; 130, 143 or 129 interrupted by Ctrl-C, SIGTERM or SIGHUP;
-        141 standard output was closed, as by `| head`.
+        Exit status: the command's own; 2 refused, or as the error says; 130, 143 or 129 interrupted by
+        Ctrl-C, SIGTERM or SIGHUP; 141 standard output was closed, as by `| head`.
     """
     accept_all_text()
     try:
@@ -35,7 +35,7 @@ def guarded(name: str, work: Callable[[], int]) -> int:
         # Another process may have gone as well, such as a server.
         status = CLOSED_PIPE if output_is_closed() else _refused(name, os_error_line(err))
     except RoboRecoverError as err:
-        status = _refused(name, str(err))
+        status = _refused(name, str(err), err.exit_status)
     except OSError as err:
         status = _refused(name, os_error_line(err))
     return flush_output(name) or status

@@ -21,20 +21,17 @@ def metrics_of(rows: Sequence[TrialRow]) -> dict[str, float]:
     Returns:
         By start (`recovery/`, `initial/`, `reversion/`): `success`, in which every scenario weighs the same;
         `success_low` and `success_high`, its 95 % interval, where there are scenarios enough for one;
-        `trials`; `invalid`, those of them that count as failures because something broke. From recovery
+        `trials`; `invalid`, those of them that count as failures because something broke (where all are,
+        there is no rate). From recovery
         points also `macro`, in which every cell that is large enough weighs the same, `macro9` over the
         paper's nine cells, where all are there, and `cell/<cell>`.
     """
     found: dict[str, float] = {}
     for start, part in summarise([asdict(r) for r in rows]).starts.items():
-        own = {
-            "success": part.rsr.value,
-            "success_low": part.rsr.low,
-            "success_high": part.rsr.high,
-            "trials": part.trials,
-            "invalid": sum(part.invalid.values()),
-        }
-        if start.value == "recovery":
+        own: dict[str, float] = {"trials": part.trials, "invalid": sum(part.invalid.values())}
+        if part.measured:
+            own |= {"success": part.rsr.value, "success_low": part.rsr.low, "success_high": part.rsr.high}
+        if start.value == "recovery" and part.measured:
             own |= {"macro": part.macro.value, "macro9": part.macro9.value}
             own |= {f"cell/{cell.cell.replace(' ', '_')}": cell.estimate.value for cell in part.cells}
         found |= {f"{start.value}/{key}": float(value) for key, value in own.items()}

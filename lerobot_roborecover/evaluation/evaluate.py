@@ -101,6 +101,7 @@ def evaluate(
 
     Raises:
         OptionError: an option, or the policy, cannot be used.
+        PolicyFailedError: the first trials of a new log all failed alike; no row is written.
         ScenarioError: the scenarios cannot be loaded, or are of several platforms.
         SimulatorError: no simulator can be made.
         TrialLogError: the log is damaged or in use.

@@ -13,6 +13,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
+from lerobot_roborecover.evaluation.first_trials import FirstTrials
 from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.work_items import WorkItem, first_units, unfinished
@@ -90,6 +91,7 @@ def run_work_items(
     **options: Any,
 ) -> RunResult:
     """Runs the work items that the session's trial log does not hold yet; without any, nothing is started.
+    A new run whose first trials all fail alike is stopped.
 
     Args:
         run: pool, protocol, trial log.
@@ -101,11 +103,14 @@ def run_work_items(
 
     Raises:
         OptionError: a cluster is not there, or lacks what is asked for.
+        PolicyFailedError: the first trials ended in the same policy error, before any action.
         SimulatorError: no simulator can be made.
     """
     todo = unfinished(run, items)
     if not todo:
         return RunResult()
+    if not run.rows():  # of a run that goes on, the policy is known to act
+        options["first"] = FirstTrials(len(todo))
     try:
         engine = open_engine(run, todo, make_host, config, stop=stop, **options)
     except CallStoppedError:  # before the policy was loaded

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.units import default_unit, initial_unit, unit_labels
 from lerobot_roborecover.analysis.summary import rate_estimate
-from lerobot_roborecover.scenario import Start
+from lerobot_roborecover.scenario import Outcome, Start
 
 _LINE_EVERY_S = 15.0
 
@@ -57,6 +57,7 @@ class RunProgress:
         self._seen: set[tuple[str, int]] = set()
         self._counts: dict[str, tuple[int, int]] = {}
         """Successes and trials by scenario."""
+        self._valid = False
         self._units: dict[str, str] = {}
         """What is independent, by scenario, as in the table at the end."""
 
@@ -67,6 +68,7 @@ class RunProgress:
             if not self.wanted(row) or key in self._seen:
                 continue
             self._seen.add(key)
+            self._valid |= Outcome(row["outcome"]).valid
             won, of = self._counts.get(key[0], (0, 0))
             self._counts[key[0]] = (won + row["success"], of + 1)
             cluster, platform = row.get("cluster") or "", str(row.get("platform", ""))
@@ -88,13 +90,13 @@ class RunProgress:
 
     @property
     def rate(self) -> float | None:
-        """Success rate so far, over scenarios that have a trial; None before the first."""
-        return self._estimate().value if self._counts else None
+        """Success rate so far, over scenarios that have a trial; None before a valid one."""
+        return self._estimate().value if self._valid else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """The rate's 95 % interval, by the estimator of the table at the end; None below two units."""
-        found = self._estimate() if self._counts else None
+        found = self._estimate() if self._valid else None
         return None if found is None or found.low != found.low else (found.low, found.high)
 
     @property

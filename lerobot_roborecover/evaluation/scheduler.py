@@ -17,6 +17,7 @@ from typing import Any
 
 from lerobot_roborecover.evaluation.active_trial import ActiveTrial, WorkerState
 from lerobot_roborecover.evaluation.batching import BatchTimer
+from lerobot_roborecover.evaluation.first_trials import FirstTrials
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import Act, Trial
 from lerobot_roborecover.evaluation.videos import VideoRecorder
@@ -59,6 +60,7 @@ class Engine:
         on_row: called with every finished trial.
         videos: trials to record videos of, if any.
         queue_of: order of the trials.
+        first: stops a run whose first trials all fail alike; None lets it go on.
         clock: returns seconds; slots' deadlines use the same clock.
     """
 
@@ -73,11 +75,12 @@ class Engine:
         on_row: Callable[[TrialRow], None] = lambda row: None,
         videos: VideoRecorder | None = None,
         queue_of: type[WorkQueue] = WorkQueue,
+        first: FirstTrials | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._clock, self._queue_of = clock, queue_of
         self._run, self._replicas, self._wait = run, list(replicas), wait
-        self._on_row, self._videos = on_row, videos
+        self._on_row, self._videos, self._first = on_row, videos, first
         self._workers = [WorkerState(slot) for slot in slots]
         self._asked: dict[Replica, tuple[list[ActiveTrial], float]] = {}
         self._company = {r: BatchTimer(batch_delay_s) for r in self._replicas}
@@ -101,6 +104,9 @@ class Engine:
 
         Returns:
             Number of trials finished.
+
+        Raises:
+            PolicyFailedError: the first trials failed alike.
         """
         self._queue = self._queue_of(unfinished(self._run, units))
         self._finished, self._stop = 0, stop
@@ -116,6 +122,7 @@ class Engine:
         for active in self._sittings():
             if active.recording is not None:
                 active.recording.drop()
+        self._write_first()
         reasons = [r.gone for r in self._replicas if r.gone]
         if len(reasons) == len(self._replicas) and not stop():
             while (unit := self._queue.take(None)) is not None:
@@ -234,6 +241,7 @@ class Engine:
             answers = replica.result(self._stop)
         except ReplicaLostError as err:
             if isinstance(err, ReplicaHungError):
+                self._write_first()
                 for active in asked:
                     active.trial.on_policy_error(err, seconds=self._clock() - began)
                     active.replica = None
@@ -345,7 +353,16 @@ class Engine:
             active.recording.drop()
         active.worker.active = None
 
+    def _write_first(self) -> None:
+        """Writes the rows that were held back, and holds back no more."""
+        first, self._first = self._first, None
+        for trial, replica in first.release() if first is not None else ():
+            self._record(trial, replica)
+
     def _record(self, trial: Trial, replica: Replica) -> None:
+        if self._first is not None and self._first.hold(trial, replica):
+            return
+        self._write_first()
         host = replica.host
         noise = host.noise(self._run.protocol.run_seed)
         row = self._run.record(trial, noise=noise, batch_size=host.max_batch if host.batched else 1)

@@ -162,7 +162,8 @@ def test_table():
     assert lines[3].split() == ["Initial-state", "success", "66.7", "[4.6,", "99.0]", "3", "3", "0"]
     assert lines[4].split()[:4] == ["Recovery", "success", "(RSR)", "58.3"]
     assert lines[4].split()[-3:] == ["3", "10", "2"]
-    assert lines[5].split() == ["Macro-9", "n/a"]
+    assert lines[5].split()[:3] == ["within", "2", "attempts"]
+    assert lines[6].split() == ["Macro-9", "n/a"]
     assert lines[-7].split() == ["Place-Scene", "Change", "*", "25.0", "n/a", "1", "4"]
     assert lines[-6].startswith("* fewer than 10 scenarios")
     assert lines[-5] == (
@@ -178,6 +179,17 @@ def test_only_small_cells_are_marked():
     large = [row(f"s{i}", 0) for i in range(10)]
     assert "*" not in format_table(summarise(large))
     assert "Approach-Wrong Pose *" in format_table(summarise(large[1:]))
+
+
+def test_invalid_trials_alone_have_no_rate():
+    rows = [row(s, k, "policy_error") for s in "ab" for k in range(2)]
+    table = format_table(summarise([*rows, row("a", 0, start="initial")]))
+    assert "No rate from recovery starts: every trial was invalid: 4 policy_error" in table
+    (line,) = (line for line in table.splitlines() if line.startswith("Recovery success"))
+    assert line.split() == ["Recovery", "success", "(RSR)", "n/a", "2", "4", "4"]
+    (line,) = (line for line in table.splitlines() if line.startswith("Initial-state"))
+    assert line.split()[2] == "100.0"
+    assert "Recovery by cell" not in table
 
 
 def test_table_of_nothing():

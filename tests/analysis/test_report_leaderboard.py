@@ -47,6 +47,15 @@ def test_order_ranks_and_standing(tmp_path):
     assert not math.isnan(strong.initial.low)
 
 
+def test_a_policy_without_a_valid_trial_has_no_rate_and_comes_last(tmp_path):
+    broken = [replace(r, outcome="policy_error", success=False) for r in policy_rows("broken", 8, 2, 0.5, 0)]
+    (board,) = made(tmp_path, broken=broken, working=policy_rows("working", 8, 2, 0.5, 1)).boards
+    assert [e.policy for e in board.entries] == ["working", "broken"]
+    assert all(math.isnan(e.value) for e in (board.entries[1].rsr, board.entries[1].behind))
+    assert ranks(board) == ["1", ""]
+    assert [row[4] for row in board_table(board).rows] == ["best", "no valid trial"]
+
+
 def test_what_cannot_be_compared_gets_boards_of_its_own(tmp_path):
     found = made(
         tmp_path,

@@ -10,6 +10,8 @@ import pytest
 
 import lerobot_roborecover as roborecover
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.first_trials import PolicyFailedError
+from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset
 from tests.support.loop import outcomes
 
@@ -147,12 +149,43 @@ def test_bad_input_is_refused(dataset, changes, words):
 
 def test_without_a_hash_rows_are_never_reused(dataset, tmp_path, caplog):
     names: dict = {"__name__": "typed_in"}
-    exec("def act(o, i): return [float('nan'), 0.0]", names)
+    exec("def act(o, i): return [0.0, 0.0]", names)
     scenario, log = roborecover.load_scenarios(str(dataset))[:1], tmp_path / "trials.jsonl"
     with caplog.at_level(logging.WARNING):
         (first,) = roborecover.evaluate(names["act"], scenario, trials=1, log=log, **QUIET)
     assert "not reused" in caplog.text
     (second,) = roborecover.evaluate(names["act"], scenario, trials=1, log=log, **QUIET)
     assert first.key() != second.key()
-    assert (second.outcome, second.steps) == ("policy_error", 0)
-    assert "non-finite action" in second.reason
+
+
+def test_a_run_whose_first_trials_fail_alike_stops_and_leaves_no_rows(dataset, tmp_path):
+    working = [False]
+
+    def act(observation, instruction):
+        if not working[0]:
+            raise KeyError("observation.state")
+        return [0.0, 0.0]
+
+    log = tmp_path / "trials.jsonl"
+    with pytest.raises(
+        PolicyFailedError, match=r"first 3 trials .* KeyError: 'observation.state'.*check policy"
+    ):
+        roborecover.evaluate(act, dataset, trials=2, log=log, **QUIET)
+    assert read_trial_log(log) == []
+    with pytest.raises(PolicyFailedError, match="the only trial"):
+        roborecover.evaluate(act, dataset, trials=1, log=log, env={"select": "id=*0"}, **QUIET)
+    working[0] = True
+    rows = roborecover.evaluate(act, dataset, trials=2, log=log, **QUIET)
+    assert {r.outcome for r in rows} == {"horizon"}
+
+
+def test_a_policy_that_acts_in_some_trials_is_measured(dataset):
+    calls = [0]
+
+    def act(observation, instruction):
+        calls[0] += 1
+        return [float("nan"), 0.0] if calls[0] < 3 else [0.0, 0.0]
+
+    rows = roborecover.evaluate(act, dataset, trials=1, **{**QUIET, "slots": 1})
+    assert sorted(r.outcome for r in rows) == ["horizon", "policy_error", "policy_error"]
+    assert all("non-finite action" in r.reason for r in rows if r.outcome == "policy_error")

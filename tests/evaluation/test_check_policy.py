@@ -271,20 +271,27 @@ def nan_policy(folder: Path) -> Path:
 
 
 def test_actions_that_are_not_numbers(run, tmp_path, run_lerobot_eval, dataset):
-    """Every trial is a `policy_error` row, under both evaluators; the simulator never sees an action."""
+    """`eval` stops with the cause and no row; under `lerobot-eval` every trial is a `policy_error` row.
+    The simulator never sees an action."""
     policy = nan_policy(tmp_path / "act")
     status, out, _ = run("check-policy", policy, "--json")
     assert status == 1
     assert "non-finite" in by_name(out)["actions"]["value"]
-    assert run("eval", policy)[0] == 0
-    fast = read_trial_log(tmp_path / "out" / "trials.jsonl")
+    status, out, err = run("eval", policy)
+    assert status == 1
+    assert "Recovery success" not in out
+    told = err.strip().splitlines()[-1]
+    assert "the first 3 trials ended in the same policy error" in told
+    assert "non-finite" in told
+    assert "check policy" in told
+    assert read_trial_log(tmp_path / "out" / "trials.jsonl") == []
     stock = run_lerobot_eval(
         "--env=roborecover_fake", f"--env.scenarios={dataset}", f"--policy.path={policy}",
         "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", out="stock",
     )  # fmt: skip
-    for rows in (fast, read_trial_log(stock / "trials.jsonl")):
-        assert [(r.outcome, r.steps) for r in rows] == [("policy_error", 0)] * 4
-        assert all("non-finite" in r.reason and "not sent" in r.reason for r in rows)
+    rows = read_trial_log(stock / "trials.jsonl")
+    assert [(r.outcome, r.steps) for r in rows] == [("policy_error", 0)] * 4
+    assert all("non-finite" in r.reason and "not sent" in r.reason for r in rows)
 
 
 def test_weights_that_were_not_loaded(tmp_path):

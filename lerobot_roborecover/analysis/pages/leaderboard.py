@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -90,6 +91,8 @@ def _standing(entry: Entry, rank: str) -> str:
         return "intervention"
     if entry.stopped:
         return "stopped early"
+    if math.isnan(entry.rsr.value):
+        return "no valid trial"
     if not rank:
         return f"incomplete: {entry.missing}" if entry.missing else "incomplete"
     if entry.verdict is None:
