@@ -62,9 +62,9 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.analysis.stats.monitor_curves import choose_threshold
     from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
     from lerobot_roborecover.detection.data.judging import judge_dataset
+    from lerobot_roborecover.policies.detectors.interface import TrainedMonitor
+    from lerobot_roborecover.policies.detectors.loading import load_monitor
     from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-    from lerobot_roborecover.policies.detectors.monitor_interface import TrainedMonitor
-    from lerobot_roborecover.policies.detectors.monitor_loading import load_monitor
     from lerobot_roborecover.utils.outputs import check_page
     from lerobot_roborecover.utils.progress import Progress
 

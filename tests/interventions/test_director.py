@@ -47,7 +47,7 @@ class At:
         self.asked = []
 
     def judge(self, observations, instructions):
-        from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
+        from lerobot_roborecover.policies.detectors.interface import Verdicts
 
         values = observations["observation.state"][:, 0].numpy()
         self.asked += values.tolist()

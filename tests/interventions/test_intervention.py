@@ -44,10 +44,10 @@ def checkpoints(tmp_path_factory):
 
 @pytest.fixture
 def monitor(monkeypatch):
-    from lerobot_roborecover.policies.detectors import monitor_loading
+    from lerobot_roborecover.policies.detectors import loading
 
     made = HashMonitor()
-    monkeypatch.setattr(monitor_loading, "load_monitor", lambda *_, **__: made)
+    monkeypatch.setattr(loading, "load_monitor", lambda *_, **__: made)
     return made
 
 

@@ -17,9 +17,9 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.continuations import Continuation
 from lerobot_roborecover.detection.data.choice import BALANCED, NATURAL, TRAIN, DataOptions, choose
 from lerobot_roborecover.detection.data.data import write_monitor_data
+from lerobot_roborecover.policies.detectors.interface import Monitor
+from lerobot_roborecover.policies.detectors.loading import load_monitor
 from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor_interface import Monitor
-from lerobot_roborecover.policies.detectors.monitor_loading import load_monitor
 from tests.support.factories import fake_scenario
 from tests.support.training import lerobot_train
 

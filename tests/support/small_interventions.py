@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
+from lerobot_roborecover.policies.detectors.interface import Verdicts
 from lerobot_roborecover.policies.runner import PolicyError
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ def judge_dataset(
     """Judges all frames, exactly as the composite policy would ask.
 
     Args:
-        monitor: loaded with `monitor_loading.load_monitor`.
+        monitor: loaded with `loading.load_monitor`.
         root: folder of a dataset that `roborecover detect data` made.
         num_workers: processes that read frames.
         on_training_scenarios: measure also what the monitor was trained on.

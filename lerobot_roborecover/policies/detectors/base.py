@@ -15,11 +15,10 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lerobot_roborecover.policies.detectors.interface import DetectorNeeds, DetectorWindow, batch_of
+from lerobot_roborecover.policies.detectors.interface import DetectorNeeds, DetectorWindow, Verdicts, batch_of
 from lerobot_roborecover.policies.detectors.monitor.base import TRAINED_ON_FILE
 from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from lerobot_roborecover.policies.detectors.monitor.files import WEIGHTS_FILE, find_file, read_trained_on
-from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
 
 PREFIX = "roborecover_"
 """Of our reward-model types; a detector's kind is what follows."""

@@ -8,8 +8,10 @@ Contract for implementations:
   the acting policy, the policy's features, or a ground truth that is unknown while a trial runs.
 - A higher score means that failure is more likely. A score of NaN means no answer, and never triggers.
 
-`MonitorDetector` turns a recovery monitor (`monitor_interface.Monitor`), which scores one observation at a
-time, into a detector.
+A recovery monitor (`Monitor`) scores one observation at a time; `MonitorDetector` makes it a detector. It is
+called at every environment step after the handoff, the handoff's own observation included, until its first
+trigger in the trial; never on replayed actions (paper, "Monitor Training and Triggering"). An answer that
+cannot be read is a NaN score, and the trial row counts it.
 """
 
 from __future__ import annotations
@@ -21,8 +23,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-
-from lerobot_roborecover.policies.detectors.monitor_interface import Monitor, Verdicts
 
 if TYPE_CHECKING:
     import torch
@@ -97,6 +97,17 @@ class DetectorWindow:
     """1 where the policy does not recover by itself, 0 where it does; NaN where unknown."""
 
 
+@dataclass(frozen=True)
+class Verdicts:
+    """What a detector says of B windows, or a monitor of B observations."""
+
+    scores: np.ndarray
+    """(B,) float32: how far the execution has gone wrong, from monitors in [0, 1], from other detectors on
+    their own scale; NaN where the answer is unparsable."""
+    triggers: np.ndarray
+    """(B,) bool: intervene now. Never True where the score is NaN."""
+
+
 @runtime_checkable
 class Detector(Protocol):
     """Scores windows: a higher score means that failure is more likely."""
@@ -113,11 +124,42 @@ class Detector(Protocol):
         """Returns scores, and alarms at the detector's own threshold; none without a threshold."""
 
 
+@runtime_checkable
+class Monitor(Protocol):
+    """Says of each observation whether execution has gone wrong."""
+
+    input_features: Mapping[str, Any]
+    """What it reads, by LeRobot key (`observation.images.image`, `observation.state`, ...), as
+    `PolicyFeature`s. A key the environment does not give is refused before the first trial."""
+    max_batch: int
+    """Observations it can judge at once."""
+
+    def judge(self, observations: Mapping[str, torch.Tensor], instructions: Sequence[str]) -> Verdicts:
+        """Judges a batch.
+
+        Args:
+            observations: as they leave the env preprocessor, before any policy's own preprocessor: LeRobot
+                keys, batch axis first; pictures (B, 3, H, W) float32 in [0, 1], vectors (B, n) float32. May
+                hold more keys than it reads.
+            instructions: B language instructions.
+        """
+
+
+@runtime_checkable
+class TrainedMonitor(Monitor, Protocol):
+    """A monitor that knows what it was trained on, as all of ours do."""
+
+    config: Any
+    """Of LeRobot's reward model."""
+    trained_on: Mapping[str, Any]
+    """Scenarios and labels of the training set; empty where they are not known."""
+
+
 class MonitorDetector:
     """A monitor as a detector: it looks at the last observation alone.
 
     Args:
-        monitor: of `monitor_loading.load_monitor`.
+        monitor: of `loading.load_monitor`.
     """
 
     def __init__(self, monitor: Monitor):

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.policies.detectors import monitor_loading
 from lerobot_roborecover.policies.detectors.base import PREFIX, DetectorRewardModel
-from lerobot_roborecover.policies.detectors.interface import Detector, DetectorNeeds, as_detector
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorNeeds, Monitor, as_detector
 from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from lerobot_roborecover.policies.detectors.monitor.files import CONFIG_FILE, find_file
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
@@ -85,11 +84,55 @@ def load_detector(
         cls = _class(kind)
         return cls.from_pretrained(head, config=config, revision=revision)
     try:
-        return as_detector(monitor_loading.load_monitor(head, device, revision=revision, **options))
+        return as_detector(load_monitor(head, device, revision=revision, **options))
     except MonitorError as err:
         if kind:
             raise
         raise MonitorError(f"{err}. Kinds that need no checkpoint: {', '.join(KINDS)}") from None
+
+
+def load_monitor(
+    path: str, device: str | None = None, revision: str | None = None, **overrides: str
+) -> Monitor:
+    """Loads a monitor by LeRobot's own registry of reward models.
+
+    Args:
+        path: folder or Hub id of a checkpoint.
+        device: where it runs; None takes what its config says, or what there is.
+        revision: of a Hub id.
+        overrides: other values of its config, e.g. `threshold="0.7"` or `base_model=FOLDER`.
+
+    Raises:
+        MonitorError: it is not there, is not a monitor, or lacks a part.
+    """
+    from lerobot.configs.rewards import RewardModelConfig
+
+    from lerobot_roborecover.policies.detectors.monitor import register_monitors
+    from lerobot_roborecover.utils.plugins import register_plugins
+
+    register_monitors()
+    register_plugins()
+    file = find_file(path, CONFIG_FILE, revision)
+    try:
+        kind = json.loads(file.read_text()).get("type")
+    except (ValueError, AttributeError) as err:
+        raise MonitorError(f"{file} is not a checkpoint's configuration ({err})") from None
+    if kind not in RewardModelConfig.get_known_choices():
+        known = sorted(k for k in RewardModelConfig.get_known_choices() if k.startswith(PREFIX))
+        raise MonitorError(f"{path} is a checkpoint of type {kind!r}; a monitor is one of {known}")
+    config = _config(path, revision, device, overrides)
+    cls: Any = _class(config.type)
+    other = MonitorError(
+        f"{path} is a reward model of type {config.type!r}, which does not judge single frames as a "
+        "monitor does; train one with policies/train/monitor_qwen3vl.yaml or monitor_small.yaml"
+    )
+    if not hasattr(cls, "judge"):  # before it is loaded
+        raise other
+    model = cls.from_pretrained(path, config=config, revision=revision)
+    model.eval()
+    if not isinstance(model, Monitor):
+        raise other
+    return model
 
 
 def check_needs(

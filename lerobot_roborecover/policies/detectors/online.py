@@ -10,8 +10,8 @@ from lerobot_roborecover.policies.detectors.interface import (
     DetectorHistory,
     DetectorWindow,
     StepObservation,
+    Verdicts,
 )
-from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 
 if TYPE_CHECKING:

@@ -26,10 +26,10 @@ from lerobot_roborecover.policies.detectors.interface import (
     TASK,
     DetectorNeeds,
     DetectorWindow,
+    Verdicts,
     batch_of,
 )
 from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
 
 PROGRESS_TYPES = ("sarm", "robometer", "topreward")
 _EXTRAS = "pip install 'lerobot_env_roborecover[rewards]'"

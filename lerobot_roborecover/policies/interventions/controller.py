@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_roborecover.policies.detectors.interface import Detector, DetectorHistory, as_detector
-from lerobot_roborecover.policies.detectors.monitor_interface import Monitor
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorHistory, Monitor, as_detector
 from lerobot_roborecover.policies.detectors.online import OnlineDetector
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.interventions.members import MemberHost

@@ -20,8 +20,8 @@ from lerobot.utils.constants import REWARD
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
+from lerobot_roborecover.policies.detectors.interface import Verdicts
 from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor_interface import Verdicts
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class MonitorRewardModel(PreTrainedRewardModel):
 
     @torch.inference_mode()
     def judge(self, observations: Mapping[str, Tensor], instructions: Sequence[str]) -> Verdicts:
-        """Judges a batch of observations; see `monitor_interface.Monitor`."""
+        """Judges a batch of observations; see `interface.Monitor`."""
         answers = self.answer({**observations, TASK: list(instructions)})
         scores = answers.scores.float().cpu().numpy().copy()
         scores[~answers.parsed.cpu().numpy()] = np.nan
