@@ -83,7 +83,7 @@ class Suggestion:
 
 @dataclass(frozen=True)
 class Candidate:
-    """What makes a rollout a candidate."""
+    """Facts that make a rollout a candidate."""
 
     id: str
     """Unique in its dataset; becomes the scenario's id."""
@@ -131,11 +131,11 @@ class CandidateSet:
 
     @property
     def platform(self) -> str:
-        """Of all candidates."""
+        """Platform of all candidates."""
         return self.trajectories.platform
 
     def row(self, episode: int) -> TrajectoryRow:
-        """What is known of an episode's rollout."""
+        """Returns the stored row of an episode's rollout."""
         return self.trajectories.rows[episode]
 
     @cached_property

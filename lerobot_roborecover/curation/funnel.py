@@ -1,4 +1,4 @@
-"""How often candidates are lost at every stage, and the table of it.
+"""Counts of the candidates lost at every stage, and their table.
 
 Each stage adds its decisions to `meta/roborecover/decisions.jsonl` of the dataset it writes, after those of
 the stages before. The last decision of a stage on a candidate counts, so that one can be taken back by

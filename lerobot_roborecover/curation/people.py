@@ -39,7 +39,7 @@ _VOTES_OF = re.compile(r"(votes(?:, some automatic,)?) of (.+)")
 
 @dataclass(frozen=True)
 class People:
-    """What a dataset says of people; programs that annotate are none."""
+    """Personal data in a dataset. Annotating programs are not people."""
 
     names: tuple[str, ...] = ()
     """Of annotators and of who rejected scenarios on inspection, in an order that tells nothing."""
@@ -85,7 +85,7 @@ class People:
 
 
 def find_people(root: Path) -> People:
-    """What a dataset of any kind says of people.
+    """Finds the personal data in a dataset of any kind.
 
     Raises:
         ScenarioError: a file of it is damaged.

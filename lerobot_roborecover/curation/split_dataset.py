@@ -37,7 +37,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True)
 class SplitReport:
-    """What the splits of a set hold and share."""
+    """Sizes of a set's splits, and what they share."""
 
     counts: Mapping[str, int]
     """Scenarios by split."""
@@ -117,7 +117,7 @@ def check_splits(root: Path, apart: tuple[str, ...] | None) -> SplitReport:
 
 
 def report_splits(scenarios: Sequence[Scenario], apart: tuple[str, ...] | None) -> SplitReport:
-    """What the splits of a set hold and share.
+    """Sizes of a set's splits, and what they share.
 
     Args:
         scenarios: with their splits.

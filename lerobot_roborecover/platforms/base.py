@@ -262,11 +262,11 @@ class Platform(TaskCatalog):
 
     @property
     def install_command(self) -> str:
-        """What installs the platform's packages."""
+        """Command that installs the platform's packages."""
         return f"pip install '{self.distribution}{f'[{self.extra}]' if self.extra else ''}'"
 
     def action_space(self, width: int) -> gym.spaces.Box:
-        """What a policy may give the simulator.
+        """Actions that the simulator accepts.
 
         Args:
             width: values in an action.

@@ -40,7 +40,7 @@ _HEAVY = ("torch", "lerobot")
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What is run."""
+    """Options of a platform check."""
 
     platform: str
     tasks: tuple[Task, ...]

@@ -22,7 +22,7 @@ GRIPPER_SECONDS = 0.5
 
 @dataclass(frozen=True)
 class Controls:
-    """How a platform is driven."""
+    """Action conventions of a platform."""
 
     platform: str
     width: int

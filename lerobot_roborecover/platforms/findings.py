@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Status(StrEnum):
-    """How a check came out; only a failure changes the exit status."""
+    """Outcome of a check; only a failure changes the exit status."""
 
     OK = "ok"
     WARNING = "warning"

@@ -41,7 +41,7 @@ class Limits(Protocol):
         robot has none."""
 
     def workspace(self) -> Workspace:
-        """Of the current reset."""
+        """Workspace after the current reset."""
 
 
 def limits_of(simulator: object) -> Limits | None:

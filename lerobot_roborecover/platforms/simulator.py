@@ -94,7 +94,7 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class ShowsProgress(Protocol):
-    """What a simulator has beside `Simulator` that tells more of a task than whether it is done."""
+    """Optional protocol of a simulator that reports a task's progress, not just its success."""
 
     def progress(self) -> float:
         """How much of the task is done after the last step or reset: 0 to 1, and 1 just where `succeeded`.
@@ -105,7 +105,7 @@ class ShowsProgress(Protocol):
 
 @runtime_checkable
 class ControlModes(Protocol):
-    """What a simulator has beside `Simulator` that reads actions in more than one way."""
+    """Optional protocol of a simulator that reads actions in more than one way."""
 
     def set_control_mode(self, mode: str) -> None:
         """Reads actions so from now on, until the next reset."""

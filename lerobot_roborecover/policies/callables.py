@@ -100,7 +100,7 @@ def callable_metadata(policy: Callable[..., Any], name: str, **others: Any) -> P
 
 @dataclass
 class CallableState:
-    """What the policy side keeps for one trial."""
+    """State that the policy side keeps for one trial."""
 
     seed: int | None
     """The trial's; None where the run has none."""

@@ -1,4 +1,4 @@
-"""What makes a policy the same policy: the content of its files, and every option that can change a result.
+"""Identity of a policy: the content of its files, and every option that can change a result.
 
 One changed byte of a checkpoint makes another policy.
 

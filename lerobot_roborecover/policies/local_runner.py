@@ -47,7 +47,7 @@ by observation."""
 
 @dataclass
 class PolicyState:
-    """What the policy side keeps for one trial."""
+    """State that the policy side keeps for one trial."""
 
     stream: list[torch.Tensor] | None
     """States of torch's generators, the CPU's and the GPU's, for the trial's next draw; None where the run
@@ -118,7 +118,7 @@ class LocalPolicyRunner:
         return self.batched and self._noise in ("none", "fixed", "argument")
 
     def start(self, seed: int | None, step: int = 0) -> PolicyState:
-        """Fresh history for a trial, or one that goes on where another host lost it.
+        """Returns fresh history for a trial, or resumes a trial that another host lost.
 
         Args:
             seed: the trial's; None where the run has none.

@@ -1,4 +1,4 @@
-"""What an engine asks of a policy; imports neither LeRobot nor torch."""
+"""Interface between an engine and a policy; imports neither LeRobot nor torch."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ type Processor = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 class ReplicaHost(Protocol):
-    """What keeps a history per trial."""
+    """A policy runner that keeps a history per trial."""
 
     @property
     def max_batch(self) -> int:
@@ -97,7 +97,7 @@ class Replica(Protocol):
 
     @property
     def host(self) -> ReplicaHost:
-        """What is asked of it at once."""
+        """The host that serves batches of trials."""
 
     @property
     def starting(self) -> bool:

@@ -59,10 +59,10 @@ class Cameras:
     def check(self, content):
         return {k: v for k, v in content.items() if k.startswith("observation.")}
 
-    def company(self, observation):
+    def batch_key(self, observation):
         from lerobot_roborecover.policies.remote.served import ServedPolicy
 
-        return ServedPolicy.company(self, observation)
+        return ServedPolicy.batch_key(self, observation)
 
     def start(self, seed, step=0):
         return seed

@@ -48,7 +48,7 @@ class Policy:
     def check(self, content):
         return {k: v for k, v in content.items() if k.startswith("observation.")}
 
-    def company(self, observation):
+    def batch_key(self, observation):
         return None
 
     def start(self, seed, step=0):

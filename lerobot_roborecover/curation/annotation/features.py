@@ -1,4 +1,4 @@
-"""What an automatic annotator has read: the numbers that the page prints at the frames that it went to."""
+"""Features that an automatic annotator has read: the numbers on the page at the frames it visited."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def frames_to_look_at(first_look: float, fps: float, last: int) -> list[int]:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """What the page says about an episode as a whole."""
+    """Facts about a whole episode, as the page shows them."""
 
     candidate: str
     instruction: str

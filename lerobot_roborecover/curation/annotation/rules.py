@@ -33,7 +33,7 @@ PAUSE_M_S, PAUSE_S = 0.04, 0.3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be entered."""
+    """The entry that the rules propose."""
 
     step: int | None = None
     stage: Stage | None = None

@@ -46,7 +46,7 @@ class Shown:
 
 
 def shown(candidates: CandidateSet, number: int, fps: float) -> Shown:
-    """What is shown of an episode.
+    """Returns the part of an episode that annotators see.
 
     Args:
         candidates: the dataset.
@@ -83,7 +83,7 @@ def first_step(candidates: CandidateSet, episode: int) -> int:
 
 
 def labels_of(steps: Steps) -> dict[str, str]:
-    """What a rollout's bodies are called, by name."""
+    """Returns the display name of each of a rollout's bodies."""
     hands = {n: hand_label(n) for n in steps.bodies if n.startswith("eef")}
     return hands | body_labels(n for n in steps.bodies if n not in hands)
 

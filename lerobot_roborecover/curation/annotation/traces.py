@@ -83,7 +83,7 @@ def traces(platform: str, actions: np.ndarray, steps: Steps, fps: float, settle_
 
 
 def action_labels(platform: str, width: int) -> dict[str, str]:
-    """What each number of an action is, by its name in `Traces`."""
+    """Returns the meaning of each number of an action, by its name in `Traces`."""
     names = platform_named(platform).action_names if platform in platform_names() else {}
     known = names.get(width) or tuple(f"action {i + 1}" for i in range(width))
     return {f"a{i}": label for i, label in enumerate(known)}

@@ -159,7 +159,7 @@ def _encodable(text: str) -> bool:
 
 @dataclass(frozen=True)
 class CurrentVotes:
-    """What an annotator's journal amounts to in one round."""
+    """An annotator's current votes in one round, from the journal."""
 
     votes: Mapping[str, Vote]
     """By candidate: the latest that stands."""

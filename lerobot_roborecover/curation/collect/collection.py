@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Collected:
-    """What a collection came to."""
+    """Result of a collection."""
 
     out: Path | None
     """The dataset; None where nothing was kept."""

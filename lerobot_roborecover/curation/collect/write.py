@@ -38,7 +38,7 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class WriterConfig:
-    """How a collection is written."""
+    """Settings for writing a collection."""
 
     records: Path
     """Folder of the rollouts' records."""
@@ -116,7 +116,7 @@ def write_collection(
 
 
 def read_about(out: Path) -> dict[str, Any] | None:
-    """What `collect.json` of a finished collection says; None where there is none.
+    """Reads `collect.json` of a finished collection; None where there is none.
 
     Raises:
         ScenarioError: it cannot be read.

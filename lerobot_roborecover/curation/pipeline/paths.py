@@ -30,5 +30,5 @@ class BuildPaths:
         self.discuss = self.root / "discuss.json"
 
     def collected(self, name: str) -> Path:
-        """Of one way in which rollouts come about."""
+        """Folder of the rollouts from one source."""
         return self.root / "collect" / name

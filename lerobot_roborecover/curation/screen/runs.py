@@ -73,7 +73,7 @@ def parse_policies(
     env: Sequence[str] = (),
     rename_maps: Sequence[str] = (),
 ) -> tuple[list[PolicySpec], list[str]]:
-    """Policies as they are written on a command line.
+    """Parses policies from the command line.
 
     Args:
         policies: `PATH` or `NAME=PATH`.
@@ -184,7 +184,7 @@ def run_policy(
     snapshots: Path | None = None,
     on_row: Callable[[Any, int, int], None] = lambda row, done, total: None,
 ) -> list[PolicyTrial]:
-    """Runs what the policy's folder does not hold yet, and returns everything.
+    """Runs the trials missing from the policy's folder, and returns all trials.
 
     Args:
         policy: who.

@@ -1,4 +1,4 @@
-"""What a screening found, as text for people."""
+"""The result of a screening as text."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ VALUE, ADVANTAGE = "roborecover.value", "roborecover.advantage"
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """Summary of the exported training data."""
 
     episodes: int
     frames: int
@@ -131,7 +131,7 @@ def export_training(
 
 
 def columns_of(line: TrainingLine, value: np.ndarray, replay: RenderedSteps) -> dict[str, np.ndarray]:
-    """What each of an episode's frames says beside observation and action.
+    """Returns the columns of an episode's frames beside observation and action.
 
     Args:
         line: the episode.

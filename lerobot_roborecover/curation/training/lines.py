@@ -167,7 +167,7 @@ def lines_of_dataset(
 
 
 def without_test(lines: Iterable[TrainingLine], dropped: Counter) -> list[TrainingLine]:
-    """Those whose scenarios may train something, and that have a step."""
+    """Returns the lines outside the test split that have at least one step."""
     found = []
     for line in lines:
         if line.scenario.split == "test":
@@ -180,5 +180,5 @@ def without_test(lines: Iterable[TrainingLine], dropped: Counter) -> list[Traini
 
 
 def policies_of(lines: Sequence[TrainingLine]) -> list[str]:
-    """Who acted, by name."""
+    """Returns the names of the acting policies."""
     return sorted({line.driver for line in lines})

@@ -29,7 +29,7 @@ TAIL = 8
 
 @dataclass(frozen=True)
 class Encoder:
-    """How a camera's video was encoded."""
+    """Encoder settings of a camera's video."""
 
     codec: str
     pix_fmt: str
@@ -55,7 +55,7 @@ class Originals:
 
 
 def read_encoders(root: Path) -> dict[str, Encoder]:
-    """How a LeRobotDataset's videos were encoded, by camera.
+    """Reads the encoder settings of a LeRobotDataset's videos, by camera.
 
     Raises:
         ScenarioError: the dataset does not say.

@@ -54,7 +54,7 @@ class OriginalRollout:
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """What one process replays."""
+    """Work of one replay process."""
 
     scenario: Scenario
     runs: tuple[DrawnRun, ...]
@@ -83,7 +83,7 @@ class _InvalidAction(Exception):
 
 @dataclass
 class _ReplayTrace:
-    """What a replay met, by step."""
+    """Record of a replay, by step."""
 
     bodies: dict[int, dict[str, Pose]] = field(default_factory=dict)
     pictures: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)

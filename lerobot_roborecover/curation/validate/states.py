@@ -27,7 +27,7 @@ _SHOWN = 3
 
 @dataclass(frozen=True)
 class StatesReport:
-    """What was written."""
+    """Summary of the written states."""
 
     scenarios: int
     filled: int

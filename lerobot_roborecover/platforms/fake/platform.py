@@ -1,4 +1,4 @@
-"""What the point mass is besides its simulator."""
+"""The point mass as a platform: everything but its simulator."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from lerobot_roborecover.scenario import Task
 
 @dataclass(frozen=True)
 class EnvFacts:
-    """What is known of an env type."""
+    """Facts about an env type."""
 
     package: str
     """Module whose import registers the Gymnasium ids `<package>/<task>`."""

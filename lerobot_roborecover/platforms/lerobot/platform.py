@@ -33,11 +33,11 @@ class LeRobotPlatform(Platform):
 
     @cached_property
     def facts(self) -> EnvFacts:
-        """Of the type; asks LeRobot's own config where it is not a known one."""
+        """Facts about the type; asks LeRobot's own config where it is not a known one."""
         return KNOWN.get(self.env_type) or _asked_of_lerobot(type_named(self.name))
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
-        """Those that the type's package registers, or that its config makes."""
+        """Returns the tasks that the type's package registers, or that its config makes."""
         given = dict(options or {})
         source = EnvSource.of(given.get("source") or {})
         if source.hub or source.config:
@@ -138,7 +138,7 @@ class LeRobotEnvPlatform(Platform):
         return member(member_name(chosen[-1] if chosen else DEFAULT_TYPE))
 
     def members(self) -> tuple[str, ...]:
-        """Those that are known without LeRobot."""
+        """Env types that are known without LeRobot."""
         return tuple(member_name(kind) for kind in KNOWN)
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:

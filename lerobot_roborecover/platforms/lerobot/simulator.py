@@ -225,7 +225,7 @@ class LeRobotSimulator:
         return {name: _hash(array) for name, array in {**parts, "success": flags}.items()}
 
     def state_sha256(self) -> str:
-        """Of `state_parts`."""
+        """SHA-256 of `state_parts`."""
         return hashlib.sha256(json.dumps(self.state_parts()).encode()).hexdigest()
 
     def snapshot(self) -> bytes:

@@ -65,7 +65,7 @@ def state_of(env: gym.Env) -> EnvState:
 
 
 class MujocoState:
-    """Of a MuJoCo model and its data.
+    """State of a MuJoCo model and its data.
 
     Args:
         model: `mujoco.MjModel`.
@@ -110,8 +110,8 @@ class MujocoState:
 
 
 class PymunkState:
-    """Of a plane of pymunk's bodies, whose pixels are taken as millimetres. What its solver remembers of
-    contacts is out of reach, so a restored state drifts.
+    """State of a plane of pymunk's bodies, whose pixels are taken as millimetres. The solver's contact cache
+    is out of reach, so a restored state drifts.
 
     Args:
         inner: the environment; attributes that are bodies name them, and `agent` is the end effector.
@@ -165,7 +165,7 @@ class PymunkState:
 
 
 class PairState:
-    """Of an environment with `get_state()` and `set_state(state)`.
+    """State of an environment with `get_state()` and `set_state(state)`.
 
     Args:
         inner: the environment.
@@ -191,7 +191,7 @@ class PairState:
 
 
 class ObservationState:
-    """Of an environment that shows nothing else than its observation, which is in the hash anyway."""
+    """State of an environment that shows nothing but its observation, which is in the hash anyway."""
 
     kind = "the observation alone"
 

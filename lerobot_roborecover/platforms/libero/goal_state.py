@@ -194,7 +194,7 @@ class GoalState:
         return np.concatenate([[1.0, opening], handle - hand, direction])
 
     def _joint(self, name: str) -> _Joint | None:
-        """Of a fixture, or of the drawer that a region lies in."""
+        """Returns the joint of a fixture, or of the drawer that a region lies in."""
         if name not in self._joints:
             self._joints[name] = self._find_joint(name)
         return self._joints[name]
@@ -222,7 +222,7 @@ class GoalState:
         return np.concatenate([[1.0], _one_hot(goal[0]), item.centre - base, place])
 
     def _neighbours(self, data: mujoco.MjData, goal: tuple[str, ...], item: np.ndarray) -> np.ndarray:
-        """Of the two nearest other objects and fixtures."""
+        """Returns the two nearest other objects and fixtures."""
         centres, halves = self._centres, self._halves
         nearest = centres + np.minimum(np.maximum(item - centres, -halves), halves) - item
         found = sorted(

@@ -18,7 +18,7 @@ _STEP_M, _STEP_RAD = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Flaws:
-    """What is wrong with a weaker controller; all off for the expert."""
+    """Flaws of a weaker controller; all off for the expert."""
 
     aim_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Constant error of the grasp, in the world."""

@@ -1,4 +1,4 @@
-"""What LIBERO is besides its simulator."""
+"""LIBERO as a platform: everything but its simulator."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ class LiberoScene:
         return float(shoulder[2]) - _WRIST_M + np.sqrt(max(left, 0.0))
 
     def joint(self, name: str) -> FixtureJoint:
-        """Of a fixture, or of the drawer that a region belongs to."""
+        """Returns the joint of a fixture, or of the drawer that a region belongs to."""
         site = self.env.object_sites_dict.get(name)
         names = self.env.get_object(name).joints if site is None else site.joints or []
         return FixtureJoint(self._model, self._data, names[0])

@@ -219,7 +219,7 @@ class LiberoSimulator:
         return self._task.reaches(np.asarray(action, dtype=np.float64))
 
     def joint_margin_rad(self) -> float:
-        """Of the arm's seven joints."""
+        """Smallest distance of the arm's seven joints from their limits; negative beyond."""
         self._require_reset()
         return self._task.reach.margin_rad(self._task.data.qpos)
 
@@ -229,7 +229,7 @@ class LiberoSimulator:
         return self._task.workspace()
 
     def state_sha256(self) -> str:
-        """SHA-256 of all that the continuation depends on."""
+        """SHA-256 of the complete state that the continuation depends on."""
         self._require_reset()
         return self._task.state_sha256()
 

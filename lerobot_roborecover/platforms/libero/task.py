@@ -234,7 +234,7 @@ class LiberoTask:
 
     @cached_property
     def place_marks(self) -> PlaceMarks:
-        """Of the goal's places."""
+        """Marks of the goal's places."""
         return PlaceMarks(self.env, self.model, self.data)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What Meta-World is besides its simulator."""
+"""Meta-World as a platform: everything but its simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What RoboTwin 2.0 is besides its simulator."""
+"""RoboTwin 2.0 as a platform: everything but its simulator."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class RobotwinPlatform(Platform):
     )
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
-        """Those that the checkout (option `robotwin_root`) has code for, in each of its configurations."""
+        """Returns the tasks in the checkout (option `robotwin_root`), in each of its configurations."""
         from lerobot_roborecover.platforms.robotwin.checkout import RobotwinCheckout
 
         checkout = RobotwinCheckout((options or {}).get("robotwin_root"))

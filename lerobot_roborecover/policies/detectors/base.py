@@ -1,4 +1,4 @@
-"""What our own detectors share: LeRobot's reward-model type, whose reward is the score."""
+"""Base class of our own detectors: a LeRobot reward model whose reward is the score."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PREFIX = "roborecover_"
 
 @dataclass
 class DetectorConfig(RewardModelConfig):
-    """What every detector has."""
+    """Options that every detector has."""
 
     device: str | None = "cpu"
     threshold: float | None = None
@@ -74,7 +74,7 @@ class DetectorRewardModel(PreTrainedRewardModel):
 
     @property
     def input_features(self) -> Mapping[str, Any]:
-        """What it reads of observations, by LeRobot key."""
+        """Observation keys that it reads."""
         return self.needs.features
 
     @property

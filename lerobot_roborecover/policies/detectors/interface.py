@@ -48,7 +48,7 @@ WILL_FAIL = "roborecover.helpless"
 
 @dataclass(frozen=True)
 class DetectorNeeds:
-    """What must be there for a detector to say anything."""
+    """Inputs that a detector needs."""
 
     features: Mapping[str, Any] = field(default_factory=dict)
     """Observations, by LeRobot key, as `PolicyFeature`s."""
@@ -69,7 +69,7 @@ class DetectorNeeds:
 
 @dataclass(frozen=True)
 class StepObservation:
-    """What one step of a trial shows."""
+    """Inputs from one step of a trial."""
 
     observation: Mapping[str, torch.Tensor]
     """As it leaves the env preprocessor, without a batch axis: pictures (3, H, W) float32 in [0, 1]."""
@@ -81,7 +81,7 @@ class StepObservation:
 
 @dataclass(frozen=True)
 class DetectorWindow:
-    """What a detector is asked about."""
+    """The steps that a detector scores at once."""
 
     glimpses: Sequence[StepObservation]
     """From the oldest to now; as many as the detector looks back at and one, fewer where the watch has just
@@ -114,7 +114,7 @@ class Detector(Protocol):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """What must be there."""
+        """Inputs that it needs."""
 
     @property
     def max_batch(self) -> int:
@@ -167,7 +167,7 @@ class MonitorDetector:
 
     @property
     def needs(self) -> DetectorNeeds:
-        """What it was trained on."""
+        """The observations that the monitor reads."""
         return DetectorNeeds(features=self.monitor.input_features)
 
     @property
@@ -190,7 +190,7 @@ def as_detector(judge: Detector | Monitor) -> Detector:
 
 
 class DetectorHistory:
-    """What one trial has shown to one detector.
+    """The recent steps of one trial, for one detector.
 
     Args:
         past: steps before now that are kept.

@@ -47,7 +47,7 @@ class RoboRecoverConstantRewardModel(DetectorRewardModel):
 
 
 class RoboRecoverElapsedRewardModel(DetectorRewardModel):
-    """How long the watch has lasted."""
+    """Scores by the steps since the watch began."""
 
     config_class = RoboRecoverElapsedConfig
     name = "roborecover_elapsed"
@@ -63,7 +63,7 @@ class RoboRecoverElapsedRewardModel(DetectorRewardModel):
 
 
 class RoboRecoverNoProgressRewardModel(DetectorRewardModel):
-    """How little has moved."""
+    """Scores by how little the state has moved."""
 
     config_class = RoboRecoverNoProgressConfig
     name = "roborecover_no_progress"
@@ -92,7 +92,7 @@ class RoboRecoverOracleRewardModel(DetectorRewardModel):
 
     @property
     def needs(self) -> DetectorNeeds:
-        """What only an evaluation knows."""
+        """A ground truth that is known to an evaluation alone."""
         return DetectorNeeds(truth=self.config.truth)
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:

@@ -22,7 +22,7 @@ class OnlineDetector:
     """Shows trials to a detector, step by step.
 
     Args:
-        detector: who judges.
+        detector: scores the trials.
         probe: into the policy that acts; None where the detector asks nothing of it.
     """
 

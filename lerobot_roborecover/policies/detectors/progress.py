@@ -37,7 +37,7 @@ _EXTRAS = "pip install 'lerobot_env_roborecover[rewards]'"
 
 @dataclass(frozen=True)
 class ProgressOptions:
-    """How a reward becomes a score."""
+    """Options for turning a reward into a score."""
 
     lag: int = 15
     """Steps over which a fall counts; 0 takes the reward itself, turned round."""

@@ -246,7 +246,7 @@ class InterventionController:
         return action[None]
 
     def _next(self, episode: InterventionState) -> Chunk:
-        """What is executed before the slot is asked about again."""
+        """Returns the actions to execute before the slot's next inference."""
         queue = episode.queue
         assert queue is not None
         take = len(queue)

@@ -85,7 +85,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         preprocessor: Processor,
         max_batch: int,
     ) -> InterventionHost:
-        """What `roborecover eval` asks in place of `select_action`."""
+        """Returns the runner that `roborecover eval` uses in place of `select_action`."""
         return InterventionHost(self.director, env_preprocessor, env_postprocessor, preprocessor, max_batch)
 
     def reset(self) -> None:

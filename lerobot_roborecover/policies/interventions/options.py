@@ -31,7 +31,7 @@ class InterventionFacts:
         return self.mode in _ROLLS_BACK
 
     def rollback_steps(self, scenario: TrialStart) -> int:
-        """How far back it may ask to go on a scenario; 0 where it does not."""
+        """Returns the most steps that it may roll back on a scenario; 0 without rollback."""
         if not self.rolls_back:
             return 0
         if self.rewind_steps is None:

@@ -44,7 +44,7 @@ _SESSION_LOST = f"{SessionLostError.__name__}: "
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """How a server is reached."""
+    """Options of the connection to a server."""
 
     url: str
     timeout_s: float = 120.0
@@ -155,7 +155,7 @@ class Connection:
         return unpack(answer, "the server's answer")
 
     def _receive(self, socket: ClientConnection) -> bytes | str:
-        """What the server says next."""
+        """Receives the server's next message."""
         try:
             return socket.recv(timeout=self._options.timeout_s)
         except TimeoutError as err:
@@ -209,7 +209,7 @@ class Connection:
         return socket
 
     def _first_words(self, socket: ClientConnection) -> bytes | str:
-        """What the server says of itself."""
+        """Receives the server's metadata."""
         return socket.recv(timeout=self._options.timeout_s)
 
     def _introduced(self, socket: ClientConnection, first: bytes | str) -> dict[str, Any]:

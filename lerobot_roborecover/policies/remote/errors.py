@@ -1,4 +1,4 @@
-"""What goes wrong between a policy's client and its server; imports nothing."""
+"""Errors between a policy's client and its server; imports nothing."""
 
 from __future__ import annotations
 

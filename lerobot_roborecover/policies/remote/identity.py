@@ -1,4 +1,4 @@
-"""Who a remote policy is: the content of its mapping, and what its server says of itself."""
+"""Identity of a remote policy: the content of its mapping, and its server's metadata."""
 
 from __future__ import annotations
 

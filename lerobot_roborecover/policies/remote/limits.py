@@ -41,7 +41,7 @@ class ByteBudget:
 
     @property
     def held(self) -> int:
-        """Bytes of all connections."""
+        """Bytes that all connections hold."""
         return sum(self._held.values())
 
     def update(self, connection: LimitedConnection, size: int) -> None:

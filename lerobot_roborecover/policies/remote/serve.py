@@ -38,7 +38,7 @@ class ServeConfig:
     max_batch: int = 64
     """Requests inferred together, at most."""
     batch_delay_ms: float = 5.0
-    """How long a request waits for company."""
+    """How long a request waits for others to share its batch."""
     max_frame_mb: int = 64
     """Of a request."""
     max_sessions: int = 256

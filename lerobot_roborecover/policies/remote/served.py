@@ -47,8 +47,8 @@ class ServedPolicy(LocalPolicyRunner):
         """Features of an observation, by the client's keys."""
         self.action_width = int(config.output_features["action"].shape[0])
 
-    def company(self, observation: Mapping[str, np.ndarray]) -> Hashable:
-        """What an observation must have in common with those that it is inferred with: keys and shapes.
+    def batch_key(self, observation: Mapping[str, np.ndarray]) -> Hashable:
+        """Returns the keys and shapes that observations of one batch must share.
 
         Args:
             observation: of `check`.
@@ -56,7 +56,7 @@ class ServedPolicy(LocalPolicyRunner):
         return tuple(sorted((key, array.shape, array.dtype.str) for key, array in observation.items()))
 
     def metadata(self, name: str) -> dict[str, Any]:
-        """What a client learns when it connects.
+        """Metadata that a client receives when it connects.
 
         Args:
             name: of the policy.

@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """How a policy is served."""
+    """Options of a policy server."""
 
     host: str = "127.0.0.1"
     port: int = 8000
@@ -100,7 +100,7 @@ class Batcher:
 
     Args:
         policy: with `act`, `start` and `finish`.
-        delay_s: how long a request waits for company.
+        delay_s: how long a request waits for others to share its batch.
         company: how many requests may come at most, now.
     """
 
@@ -143,7 +143,7 @@ class Batcher:
         """Clients may look at different things: only what has the same keys and shapes is one batch."""
         batches: dict[Any, list[_Question]] = {}
         for question in waiting:
-            batches.setdefault(self._policy.company(question.observation), []).append(question)
+            batches.setdefault(self._policy.batch_key(question.observation), []).append(question)
         for batch in batches.values():
             await self._infer_together(batch)
 

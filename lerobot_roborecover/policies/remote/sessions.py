@@ -31,7 +31,7 @@ class SessionLostError(RequestError):
 
 @dataclass(frozen=True)
 class Envelope:
-    """What a request says about its session."""
+    """Session fields of a request."""
 
     session: str
     seed: int | None = None

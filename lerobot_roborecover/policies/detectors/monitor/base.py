@@ -1,5 +1,5 @@
-"""What both monitors share: the reward-model contract of LeRobot 0.6.1, the judge's contract of the composite
-policy, and the record of what they were trained on."""
+"""Base class of both monitors: LeRobot 0.6.1's contract of reward models, the composite policy's contract of
+monitors, and the record of what they were trained on."""
 
 from __future__ import annotations
 

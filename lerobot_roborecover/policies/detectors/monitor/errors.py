@@ -1,4 +1,4 @@
-"""What monitors refuse."""
+"""Error of detectors and monitors."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from lerobot_roborecover.errors import OptionError
 
 
 class MonitorError(OptionError):
-    """A monitor cannot be built, loaded or asked; the message says what, the value and the remedy."""
+    """A monitor or detector cannot be built, loaded or asked; the message names the value and the remedy."""
