@@ -12,6 +12,14 @@ from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.utils.options import Option, make, options_of
 
 
+class _RefusedError(Exception):
+    """Carries a refusal of ours through argparse, which replaces the text of a `ValueError`."""
+
+    def __init__(self, reason: RoboRecoverError) -> None:
+        super().__init__(str(reason))
+        self.reason = reason
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose refusals are one line, and name what is nearest to what was typed."""
 
@@ -23,7 +31,10 @@ class Parser(argparse.ArgumentParser):
         words = list(sys.argv[1:] if args is None else args)
         if not any(action.nargs in (argparse.PARSER, argparse.REMAINDER) for action in self._actions):
             self._refuse_unknown(words)
-        return super().parse_known_args(words, namespace)
+        try:
+            return super().parse_known_args(words, namespace)
+        except _RefusedError as err:
+            raise err.reason from None
 
     def _refuse_unknown(self, words: Sequence[str]) -> None:
         known = list(self._option_string_actions)
@@ -102,10 +113,10 @@ def _settings(one: Option) -> dict[str, Any]:
     if spec.const is not None:
         found["const"] = spec.const
     if one.required:
-        return found if spec.positional else {**found, "required": True}
+        return found if spec.positional or not spec.asked else {**found, "required": True}
     if not spec.show_default:
         return found
-    value = one.default if spec.text is None else spec.text
+    value = spec.text if spec.parse and spec.text is not None else one.default
     return {**found, "default": list(value) if isinstance(value, tuple) else getattr(value, "value", value)}
 
 
@@ -128,7 +139,7 @@ def _type(one: Option) -> Callable[[str], Any] | None:
             try:
                 return parse(text)
             except RoboRecoverError as err:
-                raise argparse.ArgumentTypeError(str(err)) from None
+                raise _RefusedError(err) from None
 
         parsed.__name__ = getattr(parse, "__name__", "value")
         return parsed

@@ -18,6 +18,8 @@ from lerobot_roborecover.curation.resolution import (
     write_discussion,
     write_resolution,
 )
+from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.utils.text import next_command, pluralize
 
 
@@ -25,17 +27,17 @@ from lerobot_roborecover.utils.text import next_command, pluralize
 class AgreeRequest:
     """Which votes to resolve, how, and what to write."""
 
-    dataset: Path
+    dataset: Path = option(positional=True)
     """Folder of the candidate dataset that was annotated."""
-    votes: Path | None = None
-    """Folder of all votes; None takes the one inside the dataset."""
+    votes: Path | None = option(None, metavar="FOLDER")
+    """Of all votes (DATASET/meta/roborecover/votes)."""
     config: ResolutionConfig = field(default_factory=ResolutionConfig)
-    discuss: Path | None = None
-    """File for the candidates without consensus; None writes none."""
-    out: Path | None = None
-    """Folder of the scenario dataset; None writes none."""
-    license: str | None = None
-    """SPDX identifier, of that dataset."""
+    discuss: Path | None = option(None, metavar="LIST")
+    """Write them to this file, for `annotate --only`."""
+    out: Path | None = option(None, metavar="FOLDER")
+    """Write the resolved candidates as a scenario dataset."""
+    license: str | None = option(None, parse=license_argument)
+    """Licence by the Hub's identifier, of that dataset."""
 
 
 def agree(request: AgreeRequest, say: Callable[[str], None]) -> Resolution:

@@ -8,28 +8,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.curation.people import anonymise, find_people
+from lerobot_roborecover.datasets.publish import PublishConfig
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from lerobot_roborecover.datasets.publish import PublishConfig
 
 
 @dataclass(frozen=True)
 class PublishRequest:
     """What to publish and how."""
 
-    dataset: Path
+    dataset: Path = option(positional=True)
     """The dataset's folder."""
-    config: PublishConfig
+    config: PublishConfig = option()
     """Where to, and as what; pictures and what the plan calls the dataset are filled in here."""
-    anonymise: bool = False
-    """Leave out names of annotators, comments, times and working seconds."""
     render_pictures: bool = False
-    """Replay the scenarios of the card's grid, instead of taking the dataset's own frames."""
+    """Replay the scenarios of that grid here."""
+    anonymise: bool = False
+    """Publish annotator-1, annotator-2, ... for names, and no comments, times and working seconds."""
     dry_run: bool = False
-    """Say what would go where, and change nothing."""
+    """Show what would go where, and change nothing; works offline."""
 
 
 def publish_dataset(request: PublishRequest, say: Callable[[str], None], note: Callable[[str], None]) -> None:

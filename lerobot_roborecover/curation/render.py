@@ -20,6 +20,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, check_new
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.jobs import JobPool
 
@@ -31,17 +32,21 @@ SIZE = 256
 class RenderRequest:
     """What to render and how."""
 
-    dataset: Path
+    dataset: Path = option(positional=True)
     """Folder of a scenario dataset."""
-    out: Path
+    out: Path = option()
     """Folder of the new dataset; new or empty."""
-    size: int = SIZE
-    """Side of the pictures in pixels; RoboTwin's own configuration says how large they are."""
-    env: Sequence[str] = ()
-    """`name=value` options of the recovery env type."""
-    workers: int = 1
-    work: Path | None = None
-    """Finished parts, kept until all are there; None takes `OUT.parts`."""
+    size: int = option(SIZE, name="frames", metavar="SIZE")
+    """Side of the pictures, pixels.
+
+    RoboTwin's own configuration says how large they are.
+    """
+    env: Sequence[str] = option((), metavar="KEY=VALUE")
+    """Option of the recovery env type, e.g. render_quality=fast; may be given again."""
+    workers: int = option(1, name="num-workers", old=("workers",))
+    """Processes that replay and render."""
+    work: Path | None = option(None, metavar="DIR")
+    """Finished parts, kept between runs (OUT.parts)."""
 
 
 def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda done, total: None) -> int:

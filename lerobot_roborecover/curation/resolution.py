@@ -35,6 +35,7 @@ from lerobot_roborecover.curation.funnel import (
 )
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.scenario import DeviationType, Scenario, ScenarioError, Stage
+from lerobot_roborecover.utils.options import option
 
 NOT_PEOPLES = {
     "people": "",
@@ -49,12 +50,18 @@ NOT_PEOPLES = {
 class ResolutionConfig:
     """How votes become labels."""
 
-    annotators: int = 3
-    """Votes that a candidate needs (paper: three)."""
-    tolerance_steps: int = 10
-    """How far from the median a marked step may lie and still support it."""
+    annotators: int = option(3, name="votes-needed", metavar="N")
+    """Annotators a candidate needs.
+
+    The paper: three.
+    """
+    tolerance_steps: int = option(10, name="tolerance", metavar="STEPS")
+    """How far apart recovery points may lie that agree.
+
+    How far from the median a marked step may lie and still support it.
+    """
     no_consensus: Literal["discuss", "drop"] = "discuss"
-    """What becomes of a candidate without consensus."""
+    """What becomes of candidates without consensus."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,21 +28,27 @@ from lerobot_roborecover.curation.split_programme import AXES, JOINT, divide_gro
 from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.utils.options import internal, option
 
 APART = ("trajectory", "record", "instruction", "start")
+
+
+def _apart(text: str) -> tuple[str, ...] | None:
+    return parse_apart(text)
 
 
 @dataclass(frozen=True)
 class SplitConfig:
     """How to divide."""
 
-    sizes: Mapping[str, int | float]
+    sizes: Mapping[str, int | float] = internal(factory=dict)
     """By split: a number of scenarios, or a fraction below 1; all of one kind. Counts are met exactly,
     fractions as closely as the groups allow."""
     seed: int = 42
-    apart: tuple[str, ...] | None = None
+    """Of the draw."""
+    apart: tuple[str, ...] | None = option(None, name="disjoint-by", parse=_apart)
     """What no two splits may share, of `APART`; None takes what fits the platform."""
-    least: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    least: Mapping[str, Mapping[str, int]] = internal(factory=dict)
     """By split and by `cell`, `source` or `suite`: how many scenarios of each at least, where the set has as
     many. The rest is balanced as ever."""
 

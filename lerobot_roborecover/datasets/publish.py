@@ -25,9 +25,11 @@ from huggingface_hub.hf_api import RepoFile
 from lerobot_roborecover.datasets.benchmark import EVAL_FILE, VIEWER_FOLDER
 from lerobot_roborecover.datasets.card import MARK, CardFiles, make_card
 from lerobot_roborecover.datasets.contents import check_file, list_files
+from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.pull import validate
 from lerobot_roborecover.datasets.retries import ATTEMPTS, HubUnreachable, retry
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import internal, option
 from lerobot_roborecover.utils.text import pluralize
 
 LEROBOT_TAG = "v3.0"
@@ -42,22 +44,29 @@ _FILES_PER_UPLOAD = 20
 class PublishConfig:
     """What to publish, where, and as what."""
 
-    repo_id: str
-    """ "org/name" on the Hub."""
-    license: str | None = None
-    """SPDX identifier; by default the one in the dataset's manifest. Never assumed."""
+    repo_id: str = option(metavar="ORG/NAME")
+    """Where on the Hub."""
+    license: str | None = option(None, parse=license_argument)
+    """Licence by the Hub's identifier, e.g. cc-by-4.0; by default the one in the dataset's manifest."""
     version: str = "1.0.0"
+    """Of the dataset; tag roborecover-VERSION."""
     private: bool = False
-    """Of a repository that is made now; an existing one keeps its visibility."""
+    """Make a new repository private.
+
+    An existing one keeps its visibility.
+    """
     force: bool = False
-    """Let the version's tag move to what is published now."""
+    """Move the tag of a version that is published already."""
     title: str = ""
-    """Of the card; by default from the repository's name."""
+    """Of the card (default: the repository's name)."""
     pictures: bool = True
-    """Put a grid of recovery frames into the card, where the dataset holds frames."""
-    frames: Mapping[str, np.ndarray] | None = None
+    """No grid of recovery frames in the card.
+
+    There is one where the dataset holds frames.
+    """
+    frames: Mapping[str, np.ndarray] | None = internal(None)
     """(H, W, 3) uint8 by scenario id: rendered pictures for the grid instead."""
-    called: str = ""
+    called: str = internal("")
     """What the plan calls the dataset; its folder by default."""
 
 

@@ -4,33 +4,85 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
+from lerobot_roborecover.utils.options import option
 
 RELEASE_SEED = 7
 """Default seed of resets and draws (the paper's release)."""
 MAX_STARTS = 100_000
 
 
+_MAX_SEED = 2**32 - 1
+
+
+def parse_numbers(text: str, option: str) -> tuple[int, ...]:
+    """Numbers as in `0-29,40`.
+
+    Args:
+        text: numbers and ranges, separated by commas.
+        option: its name, for the message.
+
+    Raises:
+        ScenarioError: it is something else, a number occurs twice, or there are too many.
+    """
+    found: list[int] = []
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        match = re.fullmatch(r"(\d{1,10})(?:-(\d{1,10}))?", part)
+        low = int(match[1]) if match else 0
+        high = int(match[2] or match[1]) if match else -1
+        if not low <= high <= _MAX_SEED or high - low >= MAX_STARTS:
+            raise ScenarioError(
+                f"{option} {text!r:.80}: {part!r:.40} is neither a number from 0 to 2^32 - 1 nor a range "
+                f"such as 0-29 of at most {MAX_STARTS}"
+            )
+        found += range(low, high + 1)
+    twice = [n for n in set(found) if found.count(n) > 1] if len(found) != len(set(found)) else []
+    if twice or not found:
+        raise ScenarioError(f"{option} {text!r:.80}: " + (f"{twice[0]} occurs twice" if twice else "empty"))
+    return tuple(found)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    return parse_numbers(text, "--seeds") if text else ()
+
+
+def _init_states(text: str) -> tuple[int, ...]:
+    return parse_numbers(text, "--init-states") if text else ()
+
+
 @dataclass(frozen=True)
 class Starts:
     """Which initial states of each task."""
 
-    seeds: tuple[int, ...] = ()
-    """Of the resets; listed."""
-    init_states: tuple[int, ...] = ()
-    """Stored init states, on platforms that have them; listed."""
-    draw: int = 0
-    """So many for each task, drawn instead."""
+    seeds: tuple[int, ...] = option((), text="", parse=_seeds)
+    """Start from these seeds, e.g. 0-29,40.
+
+    Of the resets.
+    """
+    init_states: tuple[int, ...] = option((), text="", parse=_init_states)
+    """Start from these of LIBERO's init states, e.g. 0,3,5-9.
+
+    Of any platform that stores init states.
+    """
+    draw: int = option(0, metavar="N", text="")
+    """Draw N starts of each task instead."""
     seed: int = RELEASE_SEED
-    """Of the draw."""
-    trials: int = 1
-    """Rollouts from each start, with random streams of their own."""
+    """Of every draw: starts, noise, perturbation."""
     reset_seed: int = RELEASE_SEED
-    """Of resets from stored init states: decides what the init state leaves to chance."""
+    """Of LIBERO's resets ({default}, the paper's).
+
+    Of resets from stored init states: decides what the init state leaves to chance.
+    """
+    trials: int = 1
+    """Rollouts from each start.
+
+    With random streams of their own.
+    """
 
     def __post_init__(self):
         given = [n for n in ("seeds", "init_states", "draw") if getattr(self, n)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import json
 import sys
 import types
 import typing
@@ -16,7 +17,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from enum import Enum
 from functools import cache
+from pathlib import PurePath
 from typing import Any
+
+from lerobot_roborecover.errors import OptionError
 
 _KEY = "option"
 _COLLECTIONS = (tuple, list, Sequence)
@@ -39,6 +43,7 @@ class OptionSpec:
     group: str = ""
     show_default: bool = True
     internal: bool = False
+    asked: bool = True
 
 
 def option(
@@ -54,8 +59,8 @@ def option(
     Args:
         default: its default; without one it is required.
         factory: makes the default.
-        parse: reads the value from text.
-        text: the default as text; `parse` makes the field's default of it.
+        parse: reads the value from one word.
+        text: the default as it is written, for `parse` and for the help; empty shows none.
         spec: any of
             name: of the option, without dashes (the field's, with hyphens; `no-` before that of a switch that
                 is on by default);
@@ -68,11 +73,9 @@ def option(
             positional: an argument without a name;
             group: heading in the help of a nested dataclass's options;
             show_default: whether the default is shown: in the help and in the table of options;
-            internal: no option at all.
+            internal: no option at all;
+            asked: False where the command line may lack a required option.
     """
-    if text is not None:
-        assert parse is not None
-        default = parse(text)
     made = OptionSpec(parse=parse, text=text, **spec)
     if factory is not MISSING:
         return dataclasses.field(default_factory=factory, metadata={_KEY: made})
@@ -82,6 +85,26 @@ def option(
 def internal(default: Any = MISSING, *, factory: Any = MISSING) -> Any:
     """A field that Python alone sets: no option of the command."""
     return option(default, factory=factory, internal=True)
+
+
+def json_object(name: str, what: str) -> Callable[[str], dict[str, Any]]:
+    """Returns a reader of JSON objects.
+
+    Args:
+        name: of the option, for messages.
+        what: the object maps.
+    """
+
+    def read(text: str) -> dict[str, Any]:
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = None
+        if not isinstance(value, dict):
+            raise OptionError(f"{name}={text!r:.80}: a JSON object of {what}")
+        return value
+
+    return read
 
 
 @dataclass(frozen=True)
@@ -121,12 +144,13 @@ class Option:
         first = text.partition(" ")[0]
         if first[:1].isupper() and first[1:] == first[1:].lower() and not self.spec.help:
             text = text[:1].lower() + text[1:]
-        shown = self.spec.text or ("" if self.required or self.repeated else str(self.default))
+        plain = isinstance(self.default, (int, float, str, PurePath, Enum)) and self.spec.text is None
+        shown = str(self.default) if plain else self.spec.text or ""
         if "{default}" in text:
             return text.replace("{default}", shown)
-        if self.kind is bool or self.default is None or not shown or not self.spec.show_default:
+        if self.kind is bool or not shown or not self.spec.show_default or text.endswith(")"):
             return text
-        return text if text.endswith(")") or self.count else f"{text} ({shown})".strip()
+        return f"{text} ({shown})".strip()
 
 
 def options_of(kind: type, group: str = "") -> list[Option]:

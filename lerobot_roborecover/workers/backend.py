@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.utils.options import internal, option
 from lerobot_roborecover.workers.messages import SlotFailure
 
 if TYPE_CHECKING:
@@ -38,17 +39,17 @@ class WorkerStartup:
 class Backend:
     """Where worker processes live."""
 
-    engine: str = "local"
-    """`local`: this machine; `ray`: a Ray cluster."""
-    address: str = "auto"
-    """The cluster's; `auto` finds the one that this machine belongs to."""
-    prefix: str = "--"
+    engine: str = option("local", metavar="local|ray")
+    """This machine, or a Ray cluster."""
+    address: str = option("auto", name="ray-address", metavar="ADDRESS")
+    """The cluster's (this machine's)."""
+    prefix: str = internal("--")
     """Of its options' names, for messages."""
-    count: str = "num_workers"
+    count: str = internal("num_workers")
     """The option that says how many there are."""
-    device: str = "--device"
+    device: str = internal("--device")
     """The option that says where a policy computes."""
-    fits: bool = False
+    fits: bool = internal(False)
     """Whether fewer than asked for will do: in the middle of a command, which may have lost nodes by then."""
 
     @property

@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.curation.collect.starts import parse_numbers
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_goal
 from lerobot_roborecover.platforms.libero.expert import LiberoExpert
 from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+from lerobot_roborecover.platforms.starts import parse_numbers
 from lerobot_roborecover.platforms.stepping import advance
 from lerobot_roborecover.scenario import Pose, ScenarioError, Task
 from lerobot_roborecover.web.teleop.client import Client

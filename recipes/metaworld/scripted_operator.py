@@ -18,9 +18,9 @@ from typing import Protocol
 
 import numpy as np
 
-from lerobot_roborecover.curation.collect.starts import parse_numbers
 from lerobot_roborecover.platforms.metaworld.experts import expert, patient_expert
 from lerobot_roborecover.platforms.simulator import GOAL, HANDLE
+from lerobot_roborecover.platforms.starts import parse_numbers
 from lerobot_roborecover.web.teleop.client import Client
 from lerobot_roborecover.web.teleop.serve import TeleopConfig
 from lerobot_roborecover.web.teleop.starts import StartPoint, first_state

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.utils.options import internal, make, option, options_of
+from lerobot_roborecover.utils.options import internal, json_object, make, option, options_of
 
 
 class Colour(StrEnum):
@@ -64,8 +64,10 @@ class Outer:
     """Every Nth."""
     names: tuple[str, ...] = option((), name="name", metavar="NAME")
     """May be given again."""
-    numbers: tuple[int, ...] = option(text="1,2", parse=numbers)
+    numbers: tuple[int, ...] = option((1, 2), text="1,2", parse=numbers)
     """Those that count."""
+    names_of: dict[str, str] = option(factory=dict, name="map", parse=json_object("--map", "names"))
+    """Other names."""
     pair: tuple[str, str] = option(("a", "b"), metavar=("A", "B"))
     """Two (a b)."""
     quick: bool = False
@@ -146,7 +148,6 @@ def test_help_is_the_docstrings_with_the_defaults():
             "argument --colour: 'drak_blue' is not one of red, dark_blue; the nearest is dark_blue",
         ),
         ("a --rate x", "argument --rate: invalid float value: 'x'"),
-        ("a --rate 2 --numbers x", "argument --numbers: --numbers=x: numbers, e.g. 1,2"),
         ("a --rate 2 --numbers ?", "argument --numbers: invalid numbers value: '?'"),
         ("a", "the following arguments are required: --rate"),
         ("--rate 2", "the following arguments are required: sources"),
@@ -154,6 +155,18 @@ def test_help_is_the_docstrings_with_the_defaults():
 )
 def test_a_refusal_is_one_line_that_names_what_is_near(text, line, capsys):
     assert refused(text, capsys) == line
+
+
+def test_a_refusal_of_ours_keeps_its_words():
+    for text, said in (
+        ("a --rate 2 --numbers x", "--numbers=x: numbers, e.g. 1,2"),
+        ("a --rate 2 --map [1]", "--map='[1]': a JSON object of names"),
+        ("a --rate 2 --map {", "--map='{': a JSON object of names"),
+    ):
+        with pytest.raises(OptionError) as raised:
+            read(text)
+        assert str(raised.value) == said
+    assert read('a --rate 2 --map {"x":"y"}').names_of == {"x": "y"}
 
 
 def test_what_follows_two_dashes_is_no_option():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.cli import agree as command
+from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.curation import resolution
 from lerobot_roborecover.curation.agreement import (
     agreement,
@@ -242,18 +243,20 @@ def test_a_discussion_settles_what_the_first_round_did_not(annotated, tmp_path):
 
 
 def test_the_command_says_it_all(annotated, tmp_path, capsys):
-    import argparse
+    parser = Parser()
+    add_options(parser, command.OPTIONS)
 
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
+    def run(*argv):
+        return command.run(read_options(command.OPTIONS, parser.parse_args(argv)))
+
     args = [str(annotated), "--out", str(tmp_path / "out"), "--discuss", str(tmp_path / "list.json")]
-    assert command.run(parser.parse_args(args)) == 0
+    assert run(*args) == 0
     said = capsys.readouterr().out
     assert "3 annotators: ann, bob, cleo" in said
     assert "1 dropped, 2 kept, 1 no consensus, 1 waiting" in said
     assert "1  discarded: temporary" in said
     with pytest.raises(ScenarioError, match=r"3 annotators .* 2 are expected"):
-        command.run(parser.parse_args([*args, "--votes-needed", "2"]))
+        run(*args, "--votes-needed", "2")
 
 
 def test_votes_on_something_else_are_refused(annotated, tmp_path):

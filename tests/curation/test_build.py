@@ -32,13 +32,13 @@ EXAMPLE = Path(__file__).parents[2] / "policies" / "build" / "metaworld.yaml"
 FAKE = {
     "platform": "fake",
     "collect": {
-        "biased": {"expert": "expert_biased", "task": ["push-*"], "draw": 4, "frames": 32, "slots": 1},
+        "biased": {"expert": "expert_biased", "task": ["push-*"], "draw": 4, "frames": 32, "num_workers": 1},
         "shaken": {
             "expert": "expert_biased", "task": ["push-left"], "draw": 2, "perturb": True, "frames": 32,
-            "slots": 1,
+            "num_workers": 1,
         },
     },
-    "screen": {"trials": 2, "keep": [0, 99], "slots": 1},
+    "screen": {"trials": 2, "keep": [0, 99], "num_workers": 1},
     "validate": {"runs": 2, "num_workers": 2},
     "split": {"sizes": {"train": 0.5, "test": 0.5}},
     "render": {"frames": 64},
@@ -85,7 +85,11 @@ WHOLE = {**FAKE, "out": "x", "screen": {**FAKE["screen"], "policies": [{"path": 
         ("screen.keep", [1], "two numbers"),
         ("screen.trials", "many", "trials"),
         ("split.sizes", {"train": 1}, "at least two splits"),
-        ("annotate.no_consensus", "vote", "drop or discuss"),
+        (
+            "annotate.no_consensus",
+            "vote",
+            "annotate.no_consensus`: Cannot convert 'vote' (<class 'str'>) into one of: discuss, drop",
+        ),
         ("publish", {}, "repo_id is missing"),
     ],
 )

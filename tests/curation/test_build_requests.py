@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from lerobot_roborecover.cli import agree, collect, publish, render, screen, split, validate
-from lerobot_roborecover.cli.main import command_parser
+from lerobot_roborecover.cli import collect
+from lerobot_roborecover.cli.arguments import read_options
+from lerobot_roborecover.cli.main import command_module, command_parser
 from lerobot_roborecover.cli.tree import find_call
+from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.pipeline import requests
 from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, ChainConfig, read_config
 from lerobot_roborecover.curation.pipeline.paths import BuildPaths
@@ -102,10 +104,10 @@ def words(text: str) -> list[str]:
     return [word.replace("%", " ") for word in text.split()]
 
 
-def parsed(command: str, text: str) -> argparse.Namespace:
+def parsed(command: str, text: str) -> Any:
     call = find_call([command, *words(text)])
     assert call is not None
-    return command_parser(call).parse_args(call.rest)
+    return read_options(command_module(call.module).OPTIONS, command_parser(call).parse_args(call.rest))
 
 
 def plain(request: object) -> object:
@@ -118,7 +120,7 @@ def plain(request: object) -> object:
 
 
 def same(mine, command) -> None:
-    assert type(mine) is type(command)
+    assert isinstance(command, type(mine))
     assert plain(asdict(mine)) == plain(asdict(command))
 
 
@@ -134,16 +136,14 @@ def test_a_file_and_its_commands_ask_for_the_same(tmp_path, name, content):
     parser = collect.build_parser()
     options = requests.collect_options(config, "one", config.collect["one"], places.collected("one"))
     args, rest = parser.parse_known_args([*words(told["collect"]), "--work", str(options.work)])
-    same(options, collect.options(parser, args, rest))
-    same(requests.agree_request(config, places), agree.request(parsed("agree", told["agree"])))
-    screening = requests.screen_request(config, places, requests.screen_rule(config))
-    same(screening, screen.request(parsed("screen", told["screen"])))
-    same(requests.validation_request(config, places), validate.request(parsed("validate", told["validate"])))
-    same(requests.split_config(config), split.config(parsed("split", told["split"])))
-    same(requests.render_request(config, places), render.request(parsed("render", told["render"])))
+    same(options, collect.options(parser, read_options(CollectOptions, args), rest))
+    same(requests.agree_request(config, places), parsed("agree", told["agree"]))
+    same(requests.screen_request(config, places), parsed("screen", told["screen"]).request())
+    same(requests.validation_request(config, places), parsed("validate", told["validate"]))
+    same(requests.split_config(config), parsed("split", told["split"]).config())
+    same(requests.render_request(config, places), parsed("render", told["render"]))
     assert config.publish is not None
-    publishing = requests.publish_request(config.publish, places)
-    same(publishing, publish.request(parsed("publish", told["publish"])))
+    same(requests.publish_request(config.publish, places), parsed("publish", told["publish"]))
 
 
 def test_earlier_keys_ask_for_the_same(tmp_path, capsys):
@@ -175,7 +175,7 @@ def test_a_zero_is_not_left_out(tmp_path):
     config, places = one(content, tmp_path)
     options = requests.collect_options(config, "one", config.collect["one"], places.collected("one"))
     assert (options.starts.seeds, options.starts.seed, options.seed) == ((0,), 0, 0)
-    assert requests.screen_request(config, places, requests.screen_rule(config)).run_seed == 0
+    assert requests.screen_request(config, places).run_seed == 0
     rule = requests.validation_request(config, places).rule
     assert (rule.seed, rule.min_ssim) == (0, 0)
     assert requests.split_config(config).seed == 0

@@ -174,7 +174,11 @@ def test_every_next_line_is_accepted_by_the_parser_of_its_command(tmp_path, monk
         "--candidates", "CANDIDATES", "--out", "VALIDATED",
     ]  # fmt: skip
     request = ValidationRequest(
-        bare, out / "trials", out / "validated", [out / "a", out / "b"], env=["obs_type=state"]
+        dataset=bare,
+        trials_folder=out / "trials",
+        out=out / "validated",
+        candidates=[out / "a", out / "b"],
+        env=["obs_type=state"],
     )
     argv = accepted(f"roborecover {shlex.join(reject_next(request))}")
     args = build_parser().parse_args(argv)

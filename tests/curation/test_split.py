@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.cli import split as command
+from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.split import (
     SplitConfig,
@@ -233,11 +234,9 @@ def test_left_over_scenarios_are_named():
 
 
 def run(*args: str) -> int:
-    import argparse
-
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return command.run(parser.parse_args([str(a) for a in args]))
+    parser = Parser()
+    add_options(parser, command.OPTIONS)
+    return command.run(read_options(command.OPTIONS, parser.parse_args([str(a) for a in args])))
 
 
 def test_the_command_divides_in_place_and_refuses_to_do_it_again(tmp_path, capsys):

@@ -375,7 +375,10 @@ def test_what_is_refused(validated, tmp_path, capsys):
     assert "holds no trial of the scenarios" in refused(*out, given=["validate", other, *argv[2:]])
     # Without frames only where that is said, and then it is on record.
     request = ValidationRequest(
-        bare, root / "trials", tmp_path / "states", rule=ValidationRule(frames=False, runs=1)
+        dataset=bare,
+        trials_folder=root / "trials",
+        out=tmp_path / "states",
+        rule=ValidationRule(frames=False, runs=1),
     )
     assert validate_dataset(request).decisions[0].verdict == "kept"
     note = read_scenarios(tmp_path / "states")[0].provenance["validation"]

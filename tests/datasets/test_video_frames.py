@@ -106,7 +106,12 @@ def test_it_is_neither_read_nor_joined_nor_validated_nor_published(rollouts, tmp
     (tmp_path / "trials").mkdir()
     with pytest.raises(ScenarioError, match=refused):
         validate_dataset(
-            ValidationRequest(dataset, tmp_path / "trials", tmp_path / "out", candidates=[rollouts])
+            ValidationRequest(
+                dataset=dataset,
+                trials_folder=tmp_path / "trials",
+                out=tmp_path / "out",
+                candidates=[rollouts],
+            )
         )
 
 

@@ -15,6 +15,7 @@ from lerobot_roborecover.curation.funnel import Decision
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.replay.recorder import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.utils.options import option
 
 TOUCHED_TILT_DEG = 15.0
 """Tilt of an object, beyond any that it had in the undisturbed rollout, that counts as touched."""
@@ -24,13 +25,18 @@ TOUCHED_TILT_DEG = 15.0
 class FilterConfig:
     """Options that decide what is kept, not what is rolled out."""
 
-    skip: tuple[str, ...] = ()
-    """Exclusion rules that are not asked."""
-    only: tuple[str, ...] = ()
-    """Exclusion rules that are asked alone; empty for all."""
-    min_displacement_mm: float = 0.0
-    """Keep only perturbed rollouts in which the scene ends so far from wherever the undisturbed twin had it;
-    0 keeps all."""
+    skip: tuple[str, ...] = option((), name="no-exclude", metavar="RULE")
+    """Do not ask this exclusion rule."""
+    only: tuple[str, ...] = option((), name="exclude-only", metavar="RULE")
+    """Ask this exclusion rule alone."""
+    min_displacement_mm: float = option(
+        0.0, name="min-displacement", metavar="MM", text="", old=("scene-touched",)
+    )
+    """With --perturb: keep only rollouts in which an object ends at least so far from its path without
+    disturbance, or tipped; runs each undisturbed, too.
+
+    0 keeps all.
+    """
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def roll_out(
             progress.total -= 1
         line.show(progress)
 
-    settings = asdict(RecorderSettings(options.seed, options.expert, options.perturbed_steps))
+    settings = asdict(RecorderSettings(options.seed, options.expert, options.perturb_steps))
     slot = replace(spec.slot, server=SERVER, settings=settings)
     draws = getattr(env, "obs_type", "state") != "state"
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
@@ -118,7 +118,7 @@ def _settle(pool: SlotPool, options: CollectOptions, *, draws: bool) -> int:
         if not options.workplace.on_cluster:
             pool.configure(environment=render_environment("auto", options.device or "cpu", egl_devices()))
     return options.workplace.allocate_workers(
-        pool, options.slots, default_slots("cpu", usable_cores(), available_gb()), startup
+        pool, options.num_workers, default_slots("cpu", usable_cores(), available_gb()), startup
     )
 
 
@@ -141,7 +141,7 @@ def _run_policy(
             "one rollout; collect from its base policy"
         )
     spec = loading.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
-    places = EngineConfig(options.workplace, options.slots, options.replicas, str(config.device), draws)
+    places = EngineConfig(options.workplace, options.num_workers, options.replicas, str(config.device), draws)
     run_policy(passes, pool, partial(loading.load_host, spec), places, options.seed, on_end)
 
 

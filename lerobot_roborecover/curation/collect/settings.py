@@ -59,7 +59,7 @@ def settings_of(
         "seed": options.seed,
         "max batch": options.max_batch if options.policy else 1,
         "perturb": options.perturb,
-        "perturbed steps": options.perturbed_steps if options.perturb else 0,
+        "perturbed steps": options.perturb_steps if options.perturb else 0,
         "horizon": options.horizon,
         "reset seed": options.starts.reset_seed if by_init_state else None,
     }

@@ -13,7 +13,6 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.starts import MAX_STARTS, Starts
 from lerobot_roborecover.scenario import Reset, ScenarioError, Source, Task, TrialStart
 
-_MAX_SEED = 2**32 - 1
 _NAME_PART = 56
 """Characters of a task's name in an id, before it is cut and a hash takes the rest's place."""
 
@@ -46,33 +45,6 @@ class RolloutSpec(TrialStart):
     def record_name(self) -> str:
         """Name of the record: the candidate's id, or that of its undisturbed twin."""
         return f"{self.id}.twin" if self.twin else self.id
-
-
-def parse_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Numbers as in `0-29,40`.
-
-    Args:
-        text: numbers and ranges, separated by commas.
-        option: its name, for the message.
-
-    Raises:
-        ScenarioError: it is something else, a number occurs twice, or there are too many.
-    """
-    found: list[int] = []
-    for part in filter(None, (p.strip() for p in text.split(","))):
-        match = re.fullmatch(r"(\d{1,10})(?:-(\d{1,10}))?", part)
-        low = int(match[1]) if match else 0
-        high = int(match[2] or match[1]) if match else -1
-        if not low <= high <= _MAX_SEED or high - low >= MAX_STARTS:
-            raise ScenarioError(
-                f"{option} {text!r:.80}: {part!r:.40} is neither a number from 0 to 2^32 - 1 nor a range "
-                f"such as 0-29 of at most {MAX_STARTS}"
-            )
-        found += range(low, high + 1)
-    twice = [n for n in set(found) if found.count(n) > 1] if len(found) != len(set(found)) else []
-    if twice or not found:
-        raise ScenarioError(f"{option} {text!r:.80}: " + (f"{twice[0]} occurs twice" if twice else "empty"))
-    return tuple(found)
 
 
 def make_units(

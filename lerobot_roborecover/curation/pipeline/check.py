@@ -27,6 +27,7 @@ from lerobot_roborecover.curation.screen.screening import CURTAILED_LEAST, Scree
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import options_of
 
 _REPO = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _SIZE = 256
@@ -82,6 +83,7 @@ def check_build(config: ChainConfig) -> list[str]:
         if rejects and not Path(rejects).is_file():
             raise OptionError(f"rejects {rejects} is not there")
         validation = requests.validation_request(config, places)
+        _ = validation.rejects
         validation.workplace.check()
         if config.screen.early_stop and validation.rule.runs > CURTAILED_LEAST:
             raise OptionError(
@@ -193,12 +195,12 @@ def _check_votes(folder: Path, *, named: bool) -> None:
 
 
 def _check_screen(problems: _Problems, config: ChainConfig, places: BuildPaths) -> None:
-    rule = ScreenRule()
     with problems.of("screen.keep"):
-        rule = requests.screen_rule(config)
-        rule.check(len(config.screen.policies))
+        requests.filled(ScreenRule, config.screen).check(len(config.screen.policies))
     with problems.of("screen"):
-        request = requests.screen_request(config, places, rule)
+        # The rule was looked at above, and what is wrong with it is said once.
+        usual = {one.key: one.default for one in options_of(ScreenRule)}
+        request = requests.screen_request(config, places, **usual)
         request.check()
         for one in [(), *(spec.env for spec in request.policies)]:
             _check_env(config.platform, [*request.env, *one])

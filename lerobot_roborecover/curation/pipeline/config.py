@@ -7,17 +7,27 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import inspect
 import re
 import sys
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from lerobot_roborecover.curation.collect.options import CollectOptions
+from lerobot_roborecover.curation.publishing import PublishRequest
+from lerobot_roborecover.curation.render import RenderRequest
+from lerobot_roborecover.curation.resolution import ResolutionConfig
+from lerobot_roborecover.curation.screen.dataset import ScreenRequest
+from lerobot_roborecover.curation.split import SplitConfig
+from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.datasets.licenses import license_metadata
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_names
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import Option, options_of
 
 OLD_KEYS = {
     "slots": "num_workers", "workers": "num_workers", "film_every": "frame_stride", "curtail": "early_stop",
@@ -27,43 +37,59 @@ OLD_KEYS = {
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-@dataclass
-class CollectPart:
+class Part:
+    """A block of the file; `options_from` adds the options of the stage's command."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+def options_from[P: Part](kind: type, *without: str) -> Callable[[type[P]], type[P]]:
+    """Adds the options of a command to a block: optional all of them, since the command has the defaults.
+
+    Args:
+        kind: the command's dataclass.
+        without: options that a build sets itself.
+    """
+
+    def add(part: type[P]) -> type[P]:
+        own = inspect.get_annotations(part)
+        for one in options_of(kind):
+            if one.key not in own and one.key not in without and not one.spec.positional:
+                own[one.key], default = _optional(one)
+                setattr(part, one.key, default)
+        part.__annotations__ = own
+        return dataclass(part)
+
+    return add
+
+
+def _optional(one: Option) -> tuple[Any, Any]:
+    """The type of an option in the file, and what stands for one that is left out."""
+    if one.repeated and str(one.spec.metavar).endswith("=VALUE"):
+        return dict[str, Any], field(default_factory=dict)
+    if one.default == {}:
+        return dict[str, str], field(default_factory=dict)
+    if one.repeated:
+        return list[str], field(default_factory=list)
+    if one.count:
+        return list[Any] | None, None
+    if one.spec.parse:
+        return str | int | None, None
+    return (str if one.kind is Path else one.kind) | None, None
+
+
+@options_from(CollectOptions, "out", "work", "part_size", "description", "license")
+class CollectPart(Part):
     """One way in which rollouts come about: options of `curate collect`, or a dataset that is there."""
 
     dataset: str | None = None
     """A candidate dataset, e.g. of `roborecover curate teleop`; then nothing else is given."""
     policy: str | None = None
     """Folder or Hub id of a checkpoint."""
-    expert: str | None = None
-    """Or a scripted controller."""
-    name: str | None = None
-    task: list[str] = field(default_factory=list)
-    seeds: str | int | None = None
-    init_states: str | int | None = None
-    draw: int | None = None
-    seed: int | None = None
-    reset_seed: int | None = None
-    trials: int | None = None
-    horizon: int | None = None
-    perturb: bool | None = None
-    perturb_steps: int | None = None
-    min_displacement: float | None = None
-    frames: str | int | None = None
-    frame_stride: int | None = None
-    no_exclude: list[str] = field(default_factory=list)
-    exclude_only: list[str] = field(default_factory=list)
-    engine: str | None = None
-    ray_address: str | None = None
-    replicas: int | None = None
-    num_workers: int | None = None
-    max_batch: int | None = None
-    device: str | None = None
-    watchdog: float | None = None
-    retry_errors: bool | None = None
     env: dict[str, Any] = field(default_factory=dict)
     policy_options: dict[str, Any] = field(default_factory=dict)
-    rename_map: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -74,9 +100,9 @@ class AnnotatePart:
     """Folder of votes that are there already; by default `OUT/votes`."""
     automatic: bool = False
     """Programs annotate; their labels are marked as automatic."""
-    votes_needed: int = 3
-    tolerance: int = 10
-    no_consensus: str = "drop"
+    votes_needed: int = ResolutionConfig.annotators
+    tolerance: int = ResolutionConfig.tolerance_steps
+    no_consensus: Literal["discuss", "drop"] = "drop"
     """`drop`, or `discuss`: stop until a further round has settled them."""
 
 
@@ -93,74 +119,42 @@ class PolicyPart:
     rename_map: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass
-class ScreenPart:
+@options_from(ScreenRequest, "out", "trials_folder", "trials_from", "shard", "retry", "deterministic")
+class ScreenPart(Part):
     """Options of `roborecover curate screen`."""
 
     policies: list[PolicyPart] = field(default_factory=list)
-    trials: int | None = None
-    keep: list[Any] | None = None
-    max_invalid: int | None = None
-    early_stop: bool | None = None
-    run_seed: int | None = None
-    device: str | None = None
-    engine: str | None = None
-    ray_address: str | None = None
-    replicas: int | None = None
-    num_workers: int | None = None
-    max_batch: int | None = None
     env: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass
-class ValidatePart:
+@options_from(
+    ValidationRequest,
+    "out", "trials_folder", "states", "candidates", "reject", "reason", "accept", "by", "work",
+)  # fmt: skip
+class ValidatePart(Part):
     """Options of `roborecover curate validate`."""
 
-    runs: int | None = None
-    seed: int | None = None
-    tolerance_mm: float | None = None
-    min_ssim: float | None = None
-    no_frames: bool | None = None
-    no_outcomes: bool | None = None
-    rejects: str | None = None
-    engine: str | None = None
-    ray_address: str | None = None
-    num_workers: int | None = None
-    limit_s: float | None = None
-    env: dict[str, Any] = field(default_factory=dict)
 
-
-@dataclass
-class SplitPart:
+@options_from(SplitConfig)
+class SplitPart(Part):
     """Options of `roborecover curate split`."""
 
     sizes: dict[str, float] = field(default_factory=dict)
     """By split: counts, or fractions."""
-    seed: int | None = None
-    disjoint_by: str | None = None
     min_per_split: dict[str, dict[str, int]] | None = None
     """By split and by cell, source or suite: how many of each at least."""
 
 
-@dataclass
-class RenderPart:
+@options_from(RenderRequest, "out", "work")
+class RenderPart(Part):
     """Options of `roborecover dataset render`."""
 
-    frames: int | None = None
-    num_workers: int | None = None
-    env: dict[str, Any] = field(default_factory=dict)
 
-
-@dataclass
-class PublishPart:
+@options_from(PublishRequest, "license", "force", "render_pictures", "dry_run")
+class PublishPart(Part):
     """Options of `roborecover dataset publish`."""
 
     repo_id: str = ""
-    version: str | None = None
-    private: bool | None = None
-    title: str | None = None
-    no_pictures: bool | None = None
-    anonymise: bool | None = None
 
 
 @dataclass
@@ -287,8 +281,6 @@ def _check(config: ChainConfig) -> None:
         raise OptionError(f"screen.keep {config.screen.keep}: two numbers, fewest and most")
     if len(config.split.sizes) < 2:
         raise OptionError("split.sizes: name at least two splits, e.g. {train: 0.8, test: 0.2}")
-    if config.annotate.no_consensus not in ("drop", "discuss"):
-        raise OptionError(f"annotate.no_consensus {config.annotate.no_consensus!r}: drop or discuss")
     if config.license:
         try:
             license_metadata(config.license)

@@ -8,39 +8,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lerobot_roborecover.curation.agree import AgreeRequest
-from lerobot_roborecover.curation.collect.judge import FilterConfig
-from lerobot_roborecover.curation.collect.options import CollectOptions, parse_side
-from lerobot_roborecover.curation.collect.starts import parse_numbers
-from lerobot_roborecover.curation.pipeline.config import (
-    ChainConfig,
-    CollectPart,
-    PublishPart,
-    RenderPart,
-    ScreenPart,
-    ValidatePart,
-)
+from lerobot_roborecover.curation.collect.options import CollectOptions
+from lerobot_roborecover.curation.pipeline.config import ChainConfig, CollectPart, Part, PublishPart
 from lerobot_roborecover.curation.pipeline.paths import BuildPaths
 from lerobot_roborecover.curation.publishing import PublishRequest
 from lerobot_roborecover.curation.render import RenderRequest
 from lerobot_roborecover.curation.resolution import ResolutionConfig
 from lerobot_roborecover.curation.screen.dataset import ScreenRequest
 from lerobot_roborecover.curation.screen.runs import PolicySpec
-from lerobot_roborecover.curation.screen.screening import ScreenRule
-from lerobot_roborecover.curation.split import SplitConfig, check_least, check_sizes, parse_apart
-from lerobot_roborecover.curation.validate.request import ValidationRequest, read_rejects
-from lerobot_roborecover.curation.validate.validation import ValidationRule
-from lerobot_roborecover.datasets.publish import PublishConfig
-from lerobot_roborecover.platforms.starts import Starts
+from lerobot_roborecover.curation.split import SplitConfig, check_least, check_sizes
+from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.policies.identity import policy_identity
-from lerobot_roborecover.workers.backend import LOCAL, Backend
-
-
-def given[T](value: T | None, default: T) -> T:
-    """An option of the file, or the stage's default."""
-    return default if value is None else value
+from lerobot_roborecover.utils.options import Option, make, options_of
 
 
 def assignments(values: Mapping[str, object]) -> tuple[str, ...]:
@@ -54,9 +38,32 @@ def _text(value: object) -> str:
     return json.dumps(value) if isinstance(value, (list, dict)) else str(value)
 
 
-def workplace(part: CollectPart | ScreenPart | ValidatePart) -> Backend:
-    """Where a stage's simulators are."""
-    return Backend(given(part.engine, LOCAL.engine), given(part.ray_address, LOCAL.address))
+def filled[Request](kind: type[Request], part: Part | None, **fixed: Any) -> Request:
+    """Makes a stage's request from its block of the file.
+
+    Args:
+        kind: the request's dataclass.
+        part: its options, as the file gives them.
+        fixed: what the build sets, by the option's key.
+
+    Raises:
+        OptionError, ScenarioError: a value is none that the stage takes.
+    """
+    options = {one.key: one for one in options_of(kind)}
+    given = {key: getattr(part, key, None) for key in options if key not in fixed}
+    values = {key: _value(options[key], v) for key, v in given.items() if v is not None and v not in ([], {})}
+    return make(kind, values | fixed)
+
+
+def _value(one: Option, value: Any) -> Any:
+    """A value of the file as the option takes it."""
+    if isinstance(value, dict):
+        return assignments(value) if one.repeated else value
+    if one.count:
+        return tuple(str(word) for word in value)
+    if one.spec.parse:
+        return one.spec.parse(str(value))
+    return Path(value) if one.kind is Path else value
 
 
 def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path) -> CollectOptions:
@@ -71,52 +78,14 @@ def collect_options(config: ChainConfig, name: str, part: CollectPart, out: Path
     Raises:
         OptionError, ScenarioError: numbers or sizes are written otherwise.
     """
-    default = CollectOptions
-    starts = Starts(
-        seeds=_numbers(part.seeds, "--seeds"),
-        init_states=_numbers(part.init_states, "--init-states"),
-        draw=given(part.draw, Starts.draw),
-        seed=given(part.seed, Starts.seed),
-        trials=given(part.trials, Starts.trials),
-        reset_seed=given(part.reset_seed, Starts.reset_seed),
-    )
-    judging = FilterConfig(
-        tuple(part.no_exclude),
-        tuple(part.exclude_only),
-        given(part.min_displacement, FilterConfig.min_displacement_mm),
-    )
-    return CollectOptions(
+    work = Path(f"{out}.work-{_rollouts_key(part)}")
+    return replace(
+        filled(CollectOptions, part, out=out, work=work, license=config.license),
         platform=config.platform,
-        out=out,
-        starts=starts,
-        tasks=tuple(part.task),
-        policy=given(part.policy, default.policy),
-        expert=given(part.expert, default.expert),
-        name=given(part.name, default.name),
-        work=Path(f"{out}.work-{_rollouts_key(part)}"),
+        policy=part.policy or "",
         env=assignments(part.env),
         policy_options=assignments(part.policy_options),
-        rename_map=part.rename_map,
-        device=part.device,
-        perturb=given(part.perturb, default.perturb),
-        perturbed_steps=given(part.perturb_steps, default.perturbed_steps),
-        judging=judging,
-        seed=given(part.seed, default.seed),
-        horizon=given(part.horizon, default.horizon),
-        frame_stride=given(part.frame_stride, default.frame_stride),
-        frames=parse_side(str(given(part.frames, default.frames))),
-        workplace=workplace(part),
-        slots=given(part.num_workers, default.slots),
-        replicas=given(part.replicas, default.replicas),
-        max_batch=given(part.max_batch, default.max_batch),
-        watchdog_s=given(part.watchdog, default.watchdog_s),
-        retry_errors=given(part.retry_errors, default.retry_errors),
-        license=config.license,
     )
-
-
-def _numbers(value: str | int | None, option: str) -> tuple[int, ...]:
-    return () if value in (None, "") else parse_numbers(str(value), option)
 
 
 def _rollouts_key(part: CollectPart) -> str:
@@ -133,8 +102,7 @@ def _rollouts_key(part: CollectPart) -> str:
 def resolution_config(config: ChainConfig) -> ResolutionConfig:
     """How votes become labels."""
     part = config.annotate
-    no_consensus = "discuss" if part.no_consensus == "discuss" else "drop"
-    return ResolutionConfig(part.votes_needed, part.tolerance, no_consensus)
+    return ResolutionConfig(part.votes_needed, part.tolerance, part.no_consensus)
 
 
 def agree_request(config: ChainConfig, places: BuildPaths) -> AgreeRequest:
@@ -148,80 +116,42 @@ def agree_request(config: ChainConfig, places: BuildPaths) -> AgreeRequest:
     )
 
 
-def screen_rule(config: ChainConfig) -> ScreenRule:
-    """Who stays.
-
-    Raises:
-        ScenarioError: bounds or numbers make no sense.
-    """
-    part = config.screen
-    keep = ScreenRule.keep if part.keep is None else (str(part.keep[0]), str(part.keep[1]))
-    rule = ScreenRule
-    return ScreenRule(
-        given(part.trials, rule.trials),
-        keep,
-        given(part.max_invalid, rule.max_invalid),
-        given(part.early_stop, rule.curtail),
-    )
-
-
-def screen_request(config: ChainConfig, places: BuildPaths, rule: ScreenRule) -> ScreenRequest:
+def screen_request(config: ChainConfig, places: BuildPaths, **fixed: Any) -> ScreenRequest:
     """Of the scenarios that the votes resolved to.
 
     Args:
         config: the whole file.
         places: of the build.
-        rule: of `screen_rule`.
+        fixed: values that win over the file's, by the option's key.
 
     Raises:
         OptionError: a policy's name is not one.
+        ScenarioError: bounds or numbers make no sense.
     """
     part = config.screen
     policies = [
-        PolicySpec(p.path, given(p.name, ""), assignments(p.options), assignments(p.env), p.rename_map)
+        PolicySpec(p.path, p.name or "", assignments(p.options), assignments(p.env), p.rename_map)
         for p in part.policies
     ]
-    return ScreenRequest(
-        dataset=str(places.scenarios),
-        policies=policies,
-        out=places.screened,
-        rule=rule,
-        deterministic=[spec.name for spec, p in zip(policies, part.policies, strict=True) if p.deterministic],
-        run_seed=given(part.run_seed, ScreenRequest.run_seed),
-        env=assignments(part.env),
-        device=part.device,
-        slots=given(part.num_workers, ScreenRequest.slots),
-        max_batch=given(part.max_batch, ScreenRequest.max_batch),
-        workplace=workplace(part),
-        replicas=given(part.replicas, ScreenRequest.replicas),
-    )
+    certain = [spec.name for spec, p in zip(policies, part.policies, strict=True) if p.deterministic]
+    set_here = {"dataset": str(places.scenarios), "out": places.screened, "deterministic": certain}
+    request = filled(ScreenRequest, part, **(set_here | fixed))
+    return replace(request, policies=policies, env=assignments(part.env))
 
 
 def validation_request(config: ChainConfig, places: BuildPaths) -> ValidationRequest:
     """Of the scenarios that screening kept.
 
     Raises:
-        ScenarioError: the rule makes no sense, or rejections cannot be read.
+        ScenarioError: the rule makes no sense.
     """
-    part, rule, default = config.validate, ValidationRule, ValidationRequest
-    return ValidationRequest(
+    return filled(
+        ValidationRequest,
+        config.validate,
         dataset=places.screened,
         trials_folder=places.screened.with_name(f"{places.screened.name}.trials"),
         out=places.validated,
         candidates=[places.candidates],
-        rule=ValidationRule(
-            runs=given(part.runs, rule.runs),
-            seed=given(part.seed, rule.seed),
-            tolerance_mm=given(part.tolerance_mm, rule.tolerance_mm),
-            min_ssim=given(part.min_ssim, rule.min_ssim),
-            frames=not part.no_frames,
-            outcomes=not part.no_outcomes,
-        ),
-        env=assignments(part.env),
-        rejects=read_rejects(Path(part.rejects) if part.rejects else None),
-        workers=given(part.num_workers, default.workers),
-        workplace=workplace(part),
-        limit_s=given(part.limit_s, default.limit_s),
     )
 
 
@@ -234,35 +164,16 @@ def split_config(config: ChainConfig) -> SplitConfig:
     part = config.split
     fractions = any(size != int(size) for size in part.sizes.values())
     sizes = {name: float(size) if fractions else int(size) for name, size in part.sizes.items()}
-    check_least(part.min_per_split or {}, sizes)
-    return SplitConfig(
-        check_sizes(sizes),
-        given(part.seed, SplitConfig.seed),
-        parse_apart(part.disjoint_by),
-        part.min_per_split or {},
-    )
+    least = part.min_per_split or {}
+    check_least(least, sizes)
+    return replace(filled(SplitConfig, part), sizes=check_sizes(sizes), least=least)
 
 
 def render_request(config: ChainConfig, places: BuildPaths) -> RenderRequest:
     """Of the divided scenarios."""
-    part, default = given(config.render, RenderPart()), RenderRequest
-    return RenderRequest(
-        places.split,
-        places.rendered,
-        given(part.frames, default.size),
-        assignments(part.env),
-        given(part.num_workers, default.workers),
-    )
+    return filled(RenderRequest, config.render, dataset=places.split, out=places.rendered)
 
 
 def publish_request(part: PublishPart, places: BuildPaths) -> PublishRequest:
     """Of what a build ends with."""
-    default = PublishConfig
-    publish = PublishConfig(
-        repo_id=part.repo_id,
-        version=given(part.version, default.version),
-        private=given(part.private, default.private),
-        title=given(part.title, default.title),
-        pictures=not part.no_pictures,
-    )
-    return PublishRequest(places.result, publish, anonymise=given(part.anonymise, False))
+    return filled(PublishRequest, part, dataset=places.result)

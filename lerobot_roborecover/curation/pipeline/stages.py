@@ -211,9 +211,7 @@ class Pipeline:
             "screen",
             places.screened,
             _options(config.screen),
-            lambda: work.screen(
-                requests.screen_request(config, places, requests.screen_rule(config)), self.say
-            ),
+            lambda: work.screen(requests.screen_request(config, places), self.say),
         )
         rejects = Path(config.validate.rejects) if config.validate.rejects else None
         people = Path(f"{places.validated}.replays") / "rejects.jsonl"

@@ -34,6 +34,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.atomic_io import check_new
+from lerobot_roborecover.utils.options import internal, option
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import LOCAL, Backend
@@ -41,37 +42,47 @@ from lerobot_roborecover.workers.backend import LOCAL, Backend
 SCREENING_FILE = "screening.json"
 
 
-@dataclass(frozen=True)
+def _outcomes(text: str) -> tuple[str, ...]:
+    return tuple(outcome for outcome in text.split(",") if outcome)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScreenRequest:
     """What to screen, with which policies and how."""
 
-    dataset: str
-    """Folder, Hub id or shipped name of the scenario set."""
-    policies: Sequence[PolicySpec]
+    dataset: str = option(positional=True)
+    """Scenario set: folder, Hub id or shipped name."""
+    policies: Sequence[PolicySpec] = internal(())
+    """Those that screen."""
     out: Path
-    """Folder of the new dataset."""
-    trials_folder: Path | None = None
-    """Where trials are kept between runs; None takes `OUT.trials`."""
+    """Folder of the new dataset; new or empty."""
     rule: ScreenRule = field(default_factory=ScreenRule)
-    deterministic: Sequence[str] = ()
-    """Names of policies that do the same in every trial: one is run of each scenario, and counts as all."""
+    deterministic: Sequence[str] = option((), metavar="NAME")
+    """This policy does the same in every trial: run one of each scenario, and count it as all; may be given
+    again."""
+    trials_folder: Path | None = option(None, metavar="DIR")
+    """Trials, kept between runs (OUT.trials)."""
+    trials_from: Sequence[Path] = option((), metavar="DIR")
+    """A trials folder of another machine, to be taken over first; may be given again."""
+    shard: str = option("", metavar="K/N")
+    """Run this part's trials only, and write no dataset."""
+    retry: Sequence[str] = option((), text="", metavar="OUTCOMES", parse=_outcomes)
+    """Run invalid trials of these outcomes again, e.g. policy_error,timeout."""
     run_seed: int = 1000
-    env: Sequence[str] = ()
-    """`name=value` options of the recovery env type, for all policies."""
-    trials_from: Sequence[Path] = ()
-    """Trials folders of other machines, taken over first."""
-    shard: str = ""
-    """`k/n`: run this part's trials only, and write no dataset."""
-    retry: Sequence[str] = ()
-    """Invalid outcomes whose trials run again."""
+    """Of the trials."""
     device: str | None = None
-    slots: int = 0
-    max_batch: int = 1
-    """Observations per inference, at most; above 1 outcomes depend on who shares a batch."""
+    """Of the policies."""
+    slots: int = option(0, name="num-workers", old=("slots",))
+    """Simulators at once (one per core, or CPU of a cluster)."""
     workplace: Backend = LOCAL
     """Where trials are run."""
-    replicas: int = 0
-    """Copies of a policy on a cluster; 0 takes one per GPU, or one on the CPU."""
+    replicas: int = option(0, metavar="N")
+    """Copies of a policy on the cluster (one per GPU, or one on the CPU)."""
+    max_batch: int = 1
+    """Observations per inference, at most ({default}); above 1 the last bits of actions, and with them some
+    outcomes, depend on the other observations."""
+    env: Sequence[str] = internal(())
+    """`name=value` options of the recovery env type, for all policies."""
 
     @property
     def trials(self) -> Path:
@@ -92,11 +103,11 @@ class ScreenRequest:
                 f"--deterministic {' '.join(sorted(unknown))}: not among the policies "
                 f"{', '.join(p.name for p in self.policies)}"
             )
-        for option in (*self.env, *(o for p in self.policies for o in p.env)):
-            if option.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
+        for text in (*self.env, *(o for p in self.policies for o in p.env)):
+            if text.split("=")[0] in ("shard", "trial_log", "scenarios", "start", "split", "select"):
                 raise OptionError(
-                    f"--env {option}: screening settles this itself"
-                    + ("; use --shard" if option.startswith("shard") else "")
+                    f"--env {text}: screening settles this itself"
+                    + ("; use --shard" if text.startswith("shard") else "")
                 )
 
 

@@ -23,6 +23,7 @@ from lerobot_roborecover.curation.policy_trials import check_repeats
 from lerobot_roborecover.curation.validate.validation import ValidationRule
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
+from lerobot_roborecover.utils.options import option
 
 KEEP = ("0.1", "0.9")
 """Shares of all trials (paper: a recovery rate between 10 % and 90 %); 2 to 18 of 20."""
@@ -36,12 +37,20 @@ class ScreenRule:
 
     trials: int = 5
     """Of each policy on each scenario."""
-    keep: tuple[str, str] = KEEP
-    """Fewest and most successes that stay: two counts, or two shares of all trials (with a decimal point)."""
-    max_invalid: int = 0
-    """Invalid trials that a scenario may have; they count as failures. With more it is dropped."""
-    curtail: bool = False
-    """A scenario needs no more trials once they could not change its verdict, unless by being invalid."""
+    keep: tuple[str, str] = option(KEEP, metavar=("FEWEST", "MOST"))
+    """Successes of all policies together that stay: two counts, or two shares of all trials (0.1 0.9: 2 to 18
+    of 20)."""
+    max_invalid: int = option(0, metavar="N")
+    """Invalid trials that a scenario may have; they count as failures.
+
+    With more it is dropped.
+    """
+    curtail: bool = option(False, name="early-stop", old=("curtail",))
+    """Stop trying a scenario once no further trial could change whether it stays (after three, which
+    validation replays): the same scenarios stay after fewer trials; deterministic policies come first.
+
+    A trial that is invalid can still change a verdict.
+    """
 
     def __post_init__(self):
         if self.trials < 1 or self.max_invalid < 0:

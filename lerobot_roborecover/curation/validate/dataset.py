@@ -76,6 +76,7 @@ def validate_dataset(
         OptionError: an option of the env type cannot be used.
     """
     request.workplace.check()
+    screening, rejects = request.trials, request.rejects  # refused before hours of replays
     check_replaceable(request.out)
     if request.rule.frames and importlib.util.find_spec("skimage") is None:
         raise OptionError(
@@ -87,11 +88,11 @@ def validate_dataset(
     for found in sets:
         check_frames(found.root, [row.steps for row in found.trajectories.rows], thorough=True)
     check_frames(Path(request.dataset), [len(s.prefix) for s in scenarios], thorough=True)
-    trials = read_screening(request.trials_folder)
+    trials = read_screening(screening)
     originals = OriginalFrames(request.dataset, sets, request.rule.frames)
     jobs = make_jobs(request, scenarios, trials, sets, originals)
     replays = replay_all(request, scenarios, jobs, originals, progress)
-    rejected = _people(request, {s.id for s in scenarios})
+    rejected = _people(request, rejects, {s.id for s in scenarios})
     decisions = {s.id: judge(s.id, replays[s.id], request.rule) for s in scenarios}
     final = {i: _with_person(d, rejected.get(i)) for i, d in decisions.items()}
     page = request.folder / PAGE_FILE
@@ -125,7 +126,7 @@ def describe(request: ValidationRequest, made: Validation) -> str:
 def reject_next(request: ValidationRequest) -> list[str]:
     """Arguments of the same validation with one scenario rejected."""
     rule = request.rule
-    argv = ["curate", "validate", str(request.dataset), "--trials-folder", str(request.trials_folder)]
+    argv = ["curate", "validate", str(request.dataset), "--trials-folder", str(request.trials)]
     argv += [w for path in request.candidates for w in ("--candidates", str(path))]
     argv += [w for option in request.env for w in ("--env", option)]
     argv += ["--runs", str(rule.runs), "--seed", str(rule.seed)]
@@ -222,20 +223,22 @@ def _write(
         write_stage(folder, request.dataset, kept, decisions, (VALIDATION_FILE, record), manifest)
 
 
-def _people(request: ValidationRequest, ids: set[str]) -> dict[str, dict[str, Any]]:
+def _people(
+    request: ValidationRequest, rejects: Mapping[str, str], ids: set[str]
+) -> dict[str, dict[str, Any]]:
     """Rejections that stand, by id, after this request's own are on record.
 
     Raises:
         ScenarioError: an id is unknown, or a rejection has no reason.
     """
-    for one, reason in [*request.rejects.items(), *((i, "-") for i in request.accepts)]:
+    for one, reason in [*rejects.items(), *((i, "-") for i in request.accepts)]:
         if one not in ids:
             raise ScenarioError(f"{one!r:.140} is no scenario of {request.dataset}; check the id")
         if not reason.strip():
             raise ScenarioError(f"rejecting {one} needs a reason: --reason TEXT")
     with Journal(request.folder / REJECTS_FILE, _SCHEMA) as journal:
         standing = {r["id"]: r for r in journal.records if r["id"] in ids}
-        new = [{"id": i, "rejected": True, "reason": r, "by": request.by} for i, r in request.rejects.items()]
+        new = [{"id": i, "rejected": True, "reason": r, "by": request.by} for i, r in rejects.items()]
         new += [{"id": i, "rejected": False, "reason": "", "by": request.by} for i in request.accepts]
         keys = ("rejected", "reason")
         fresh = [r for r in new if any(standing.get(r["id"], {}).get(k) != r[k] for k in keys)]

@@ -71,7 +71,7 @@ def make_jobs(
     """
     if not any((s.id, s.sha256()) in trials for s in scenarios):
         raise ScenarioError(
-            f"{request.trials_folder} holds no trial of the scenarios of {request.dataset}; name the folder "
+            f"{request.trials} holds no trial of the scenarios of {request.dataset}; name the folder "
             "of their own screening"
         )
     options = simulator_options(scenarios[0].platform, request, originals)

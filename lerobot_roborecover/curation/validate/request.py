@@ -2,44 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_roborecover.curation.validate.validation import ValidationRule
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ValidationRequest:
     """What to validate and how."""
 
-    dataset: Path
-    """Folder of the scenario dataset."""
-    trials_folder: Path
-    """As `screen` left it: one folder a policy."""
+    dataset: Path = option(positional=True)
+    """Folder of a screened scenario dataset."""
+    trials_folder: Path | None = option(None, metavar="DIR")
+    """Where screen kept the trials.
+
+    One folder a policy.
+    """
+    states: bool = False
+    """Only replay the prefixes of a set that was made elsewhere or by an earlier version, and write the
+    hashes of their states: no scenario is judged, and nothing else changes."""
+    candidates: Sequence[Path] = option((), metavar="DIR")
+    """Candidate dataset that the scenarios were made from: original poses and frames; may be given again."""
     out: Path
-    """Folder of the new dataset; an earlier validation's that nothing was made of is replaced."""
-    candidates: Sequence[Path] = ()
-    """Candidate datasets that the scenarios were made from: original poses and frames."""
+    """Folder of the new dataset.
+
+    An earlier validation's that nothing was made of is replaced.
+    """
     rule: ValidationRule = field(default_factory=ValidationRule)
-    env: Sequence[str] = ()
-    """`name=value` options of the recovery env type: as the originals were rendered."""
-    rejects: Mapping[str, str] = field(default_factory=dict)
-    """Reasons by id of scenarios that a person rejects."""
-    accepts: Sequence[str] = ()
-    """Ids whose rejection a person takes back."""
-    by: str = "a person"
-    """Who looked; goes into the decisions."""
-    workers: int = 0
-    """Processes that replay; 0 takes one, or all CPUs of a cluster."""
+    env: Sequence[str] = option((), metavar="KEY=VALUE")
+    """Option of the recovery env type, as the originals were rendered; may be given again."""
+    reject: Sequence[str] = option((), metavar="ID")
+    """On looking at the sheets; repeat it."""
+    reason: str = ""
+    """Why, for every --reject."""
+    rejects_file: Path | None = option(None, name="rejects", metavar="FILE")
+    """The same as a file: a line each, the id, a blank, the reason."""
+    accepts: Sequence[str] = option((), name="accept", metavar="ID")
+    """Take a rejection back."""
+    by: str = option("a person", metavar="NAME")
+    """Who looked.
+
+    Goes into the decisions.
+    """
+    workers: int = option(0, name="num-workers", old=("workers",))
+    """Processes that replay (1, or every CPU of a cluster)."""
     workplace: Backend = LOCAL
     """Where they are."""
-    limit_s: float = 900.0
-    """Longest that all replays of one scenario may take."""
-    work: Path | None = None
-    """Working folder; None takes `OUT.replays`."""
+    limit_s: float = 900
+    """For one scenario's replays."""
+    work: Path | None = option(None, metavar="DIR")
+    """Replays and sheets, kept between runs (OUT.replays)."""
+
+    @property
+    def trials(self) -> Path:
+        """The trials' folder.
+
+        Raises:
+            OptionError: none is given.
+        """
+        if self.trials_folder is None:
+            raise OptionError(
+                "--trials-folder is missing: name the folder of trials that roborecover curate screen kept"
+            )
+        return self.trials_folder
+
+    @property
+    def rejects(self) -> dict[str, str]:
+        """Reasons by id of scenarios that a person rejects.
+
+        Raises:
+            ScenarioError: the file of rejections cannot be read, or an id has no reason.
+        """
+        return read_rejects(self.rejects_file) | dict.fromkeys(self.reject, self.reason)
 
     @property
     def folder(self) -> Path:

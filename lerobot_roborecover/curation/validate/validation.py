@@ -40,13 +40,16 @@ class ValidationRule:
     seed: int = 42
     """Of the draw."""
     tolerance_mm: float = HANDOFF_TOLERANCE_M * 1e3
-    """Largest displacement of an end effector or an object, millimetres."""
+    """Of end effectors and objects.
+
+    The largest displacement, millimetres.
+    """
     min_ssim: float = 0.99
     """The mean SSIM must exceed it."""
     frames: bool = True
-    """Compare frames."""
+    """Compare states alone; the provenance says so."""
     outcomes: bool = True
-    """Compare how the screening runs end."""
+    """Do not compare how the screening runs end."""
 
     def __post_init__(self):
         if self.runs < 1 or self.tolerance_mm <= 0 or not 0 <= self.min_ssim < 1:
