@@ -11,41 +11,54 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_roborecover.doctor.software import check_versions
 from lerobot_roborecover.platforms import all_platforms, versions
+from lerobot_roborecover.platforms.findings import Status
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def test_the_known_lerobot_is_the_pinned_one():
+def test_lerobot_has_a_lower_bound_alone_and_the_tested_one_is_in_the_constraints():
     asked = [one for few in PROJECT["optional-dependencies"].values() for one in few]
     asked += PROJECT["dependencies"]
-    pins = {m[1] for one in asked if (m := re.fullmatch(r"lerobot\[[\w,]+\]==(.+)", one))}
-    assert pins == {versions.LEROBOT}
+    pins = {m[1] for one in asked if (m := re.fullmatch(r"lerobot\[[\w,]+\](.+)", one))}
+    assert pins == {f">={versions.LEROBOT}"}
+    assert f"lerobot=={versions.LEROBOT}" in (ROOT / "constraints.txt").read_text().splitlines()
     for platform in all_platforms():
         if platform.required_versions.get("lerobot"):
             assert platform.required_versions["lerobot"] == (versions.LEROBOT,), platform.name
 
 
-@pytest.mark.parametrize(("found", "said"), [("0.6.2", "this is LeRobot 0.6.2"), (None, "not installed")])
-def test_another_one_is_told_in_one_line_with_the_remedy(found, said, monkeypatch):
+@pytest.mark.parametrize(("found", "said"), [("0.6.0", "lerobot is 0.6.0"), (None, "not installed")])
+def test_an_older_one_is_told_in_one_line_with_the_remedy(found, said, monkeypatch):
     monkeypatch.setattr(versions, "installed", lambda name: found)
     note = versions.lerobot_note()
     assert said in note
     assert "\n" not in note
-    assert "pip install 'lerobot==0.6.1'" in note
-    monkeypatch.setattr(versions, "installed", lambda name: versions.LEROBOT)
+    assert "pip install 'lerobot>=0.6.1'" in note
+
+
+@pytest.mark.parametrize("found", ["0.6.1", "0.6.2", "0.7.0", "1.0.0.dev1"])
+def test_a_newer_one_is_recorded_and_not_refused(found, monkeypatch):
+    here = {"lerobot": found, "mujoco": "3.3.2", "metaworld": "3.0.0"}
+    monkeypatch.setattr(versions, "installed", here.get)
     assert versions.lerobot_note() is None
+    assert versions.version_problems("metaworld") == []
+    (check,) = (c for c in check_versions("metaworld", True) if c.name.endswith("lerobot"))
+    assert (check.status, found in check.detail) == (Status.OK, True)
+    here["mujoco"] = "3.4.0"
+    assert len(versions.version_problems("metaworld")) == 1, "physics is"
 
 
 def test_it_is_told_before_anything_of_lerobot_is_imported(monkeypatch, caplog):
-    monkeypatch.setattr(versions, "installed", lambda name: "99.0")
+    monkeypatch.setattr(versions, "installed", lambda name: "0.5")
     monkeypatch.delitem(sys.modules, "lerobot_env_roborecover", raising=False)
     # As where the plugin cannot be imported any more.
     monkeypatch.setitem(sys.modules, "lerobot_roborecover.plugin", None)
     with caplog.at_level(logging.WARNING), pytest.raises(ImportError):
         __import__("lerobot_env_roborecover")
-    assert "this is LeRobot 99.0" in caplog.text
+    assert "lerobot is 0.5;" in caplog.text
 
 
 def test_extras_of_a_source_tree(tmp_path):

@@ -193,7 +193,7 @@ class _Recording:
             import rerun
         except ModuleNotFoundError:
             raise ScenarioError(
-                "a .rrd recording needs rerun, which is not installed: pip install 'lerobot[viz]==0.6.1'"
+                "a .rrd recording needs rerun, which is not installed: pip install 'lerobot[viz]'"
             ) from None
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rerun = rerun

@@ -51,7 +51,7 @@ def _lerobot_eval() -> str:
     beside = Path(sys.executable).with_name("lerobot-eval")
     found = str(beside) if beside.is_file() else shutil.which("lerobot-eval")
     if found is None:
-        raise DemoError(f"no lerobot-eval beside {sys.executable} nor on PATH. pip install lerobot==0.6.1")
+        raise DemoError(f"no lerobot-eval beside {sys.executable} nor on PATH. pip install 'lerobot>=0.6.1'")
     return found
 
 

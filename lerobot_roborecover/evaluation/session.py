@@ -30,7 +30,7 @@ from lerobot_roborecover.platforms.robot_fingerprint import (
     compare_robots,
     is_robot_entry,
 )
-from lerobot_roborecover.platforms.versions import installed, required, version_problems
+from lerobot_roborecover.platforms.versions import STAMPS, installed, required, version_problems
 from lerobot_roborecover.policies.interventions.options import InterventionFacts
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Scenario, Start, TrialStart
@@ -405,7 +405,7 @@ def _check_versions(scenarios: ScenarioSet, platform: str, assets: Mapping[str, 
                 "scenario %s was recorded with %s %s; here it is %s", scenario_id, name, version, assets[name]
             )
         here = installed(name)
-        if here is not None and here != version:
+        if name not in STAMPS and here is not None and here != version:
             problems.append(f"scenario {scenario_id} was recorded with {name} {version}; here it is {here}")
     if not problems:
         return

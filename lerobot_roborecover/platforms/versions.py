@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import metadata
 
+from packaging.version import Version
+
 from lerobot_roborecover.platforms import platform_named
 
 LEROBOT = "0.6.1"
-"""The LeRobot that this package is made for; `pyproject.toml` pins the same."""
+"""The oldest LeRobot that this package runs with, and the one that its tests run with (`constraints.txt`)."""
+STAMPS = ("lerobot",)
+"""Distributions whose version is in every row that a platform writes, and is told apart, but not refused:
+LeRobot brings policies and observations, and physics is in the pinned packages."""
 
 
 def installed(distribution: str) -> str | None:
@@ -44,6 +49,9 @@ def version_problems(platform: str) -> list[str]:
                 f"{distribution} is not installed; {platform} scores require {wanted}: "
                 f"{install_command(platform)}"
             )
+        elif distribution in STAMPS:
+            if note := stamp_problem(found):
+                problems.append(note)
         elif found not in versions:
             problems.append(
                 f"{distribution} is {found}; {platform} scores require {wanted}: "
@@ -52,14 +60,16 @@ def version_problems(platform: str) -> list[str]:
     return problems
 
 
-def lerobot_note() -> str | None:
-    """One line on the LeRobot that is installed, with what to do; None where it is the known one."""
-    found = installed("lerobot")
-    if found == LEROBOT:
+def stamp_problem(found: str) -> str | None:
+    """What is wrong with an installed LeRobot, with the remedy; None from the oldest one on."""
+    if Version(found) >= Version(LEROBOT):
         return None
-    here = f"this is LeRobot {found}" if found else "LeRobot is not installed as a package"
-    return (
-        f"lerobot_env_roborecover is made for LeRobot {LEROBOT}, and {here}: pip install "
-        f"'lerobot=={LEROBOT}'; or, to go on with this one, see what differs in docs/lerobot_main.md, and "
-        "score with --env.strict_versions=false"
-    )
+    return f"lerobot is {found}; RoboRecover runs with {LEROBOT} or newer: pip install 'lerobot>={LEROBOT}'"
+
+
+def lerobot_note() -> str | None:
+    """One line on the LeRobot that is installed, with what to do; None where it can be used."""
+    found = installed("lerobot")
+    if found is None:
+        return f"LeRobot is not installed as a package: pip install 'lerobot>={LEROBOT}'"
+    return stamp_problem(found)

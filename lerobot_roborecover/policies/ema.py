@@ -7,7 +7,8 @@ optimizer's state with each checkpoint and loads it on `--resume`, and the shado
 export-ema` turns it into a plain checkpoint.
 
 LeRobot averages by itself from huggingface/lerobot#4323 on. There this optimizer is not needed any more; it
-works as before, so that one training configuration does for both, and names the options to use instead.
+works as before, so that one training configuration does for both, and names the options to use instead. To
+be removed, with `export_ema`, once the oldest LeRobot that we run with has `--ema.enable`.
 """
 
 from __future__ import annotations

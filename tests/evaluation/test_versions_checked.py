@@ -35,6 +35,14 @@ def test_unless_told_otherwise(recorded_elsewhere, tmp_path, caplog):
     assert "numpy 0.0.1" in caplog.text
 
 
+def test_a_fingerprint_of_another_lerobot_is_not_refused(tmp_path):
+    scenario = fake_scenario(0)
+    other = replace(scenario, fingerprint=replace(scenario.fingerprint, versions={"lerobot": "0.0.1"}))
+    root = write_scenarios(tmp_path / "set", [other])
+    (row,) = evaluate(root, tmp_path / "log.jsonl", trials=1, batch=1)
+    assert row.outcome in ("success", "horizon")
+
+
 def test_a_wrong_simulator_version_is_refused(tmp_path, monkeypatch):
     root = write_scenarios(tmp_path / "set", [fake_scenario(0)])
     monkeypatch.setattr(

@@ -41,9 +41,9 @@ def metaworld_instruction(name: str) -> str:
 def _metaworld_config() -> dict:
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
-        raise SimulatorError("LeRobot is not installed. Install it with: pip install lerobot==0.6.1")
+        raise SimulatorError("LeRobot is not installed. Install it with: pip install 'lerobot>=0.6.1'")
     path = Path(next(iter(spec.submodule_search_locations))) / "envs" / "metaworld_config.json"
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise SimulatorError(f"LeRobot has no {path}; install lerobot==0.6.1") from None
+        raise SimulatorError(f"LeRobot has no {path}; LeRobot 0.6.1 has it") from None
