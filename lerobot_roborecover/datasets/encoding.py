@@ -10,8 +10,9 @@ something is written.
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
 
@@ -23,7 +24,7 @@ from lerobot.datasets.video_utils import StreamingVideoEncoder
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX, Frame, features_of
 from lerobot_roborecover.datasets.lerobot_folder import check_lerobot_folder, local_repo_id
 from lerobot_roborecover.datasets.video_frames import REMEDY, check_frames
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 QUEUE = 30
 """Frames of a camera that may wait for the encoder: some 6 MB at 256 x 256."""
@@ -242,3 +243,44 @@ class EpisodeWriter:
         self.close()
         if kind is None and self._dataset is not None:
             check_frames(self._root, self._steps, thorough=True)
+
+
+def write_lerobot_dataset(
+    root: Path,
+    scenarios: Sequence[Scenario],
+    episodes: Iterable[Iterable[Frame]],
+    fps: int,
+    *,
+    first_index: int = 0,
+) -> None:
+    """Writes one episode per scenario as a LeRobotDataset in a folder that does not exist yet.
+
+    Args:
+        root: the dataset's folder.
+        scenarios: in the order of `scenarios.parquet`.
+        episodes: for each scenario its frames, as many as its prefix has actions.
+        fps: frame rate.
+        first_index: row of the first scenario in `scenarios.parquet`, where these are a part of a set.
+
+    Raises:
+        ScenarioError: numbers of scenarios, actions, frames and video frames disagree.
+    """
+    with EpisodeWriter(root, fps, scenarios[0].platform) as writer:
+        for index, (scenario, frames) in enumerate(_pair(scenarios, episodes), first_index):
+            writer.write(
+                Episode(
+                    f"scenario {scenario.id}", scenario.prefix, frames, index, scenario.task.instruction, {}
+                )
+            )
+
+
+def _pair(
+    scenarios: Sequence[Scenario], episodes: Iterable[Iterable[Frame]]
+) -> Iterator[tuple[Scenario, Iterable[Frame]]]:
+    for scenario, frames in zip_longest(scenarios, episodes):
+        if scenario is None or frames is None:
+            raise ScenarioError(
+                f"{len(scenarios)} scenarios, but {'more' if scenario is None else 'fewer'} episodes; "
+                "there is one episode for each scenario"
+            )
+        yield scenario, frames

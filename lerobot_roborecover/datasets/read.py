@@ -43,9 +43,9 @@ from lerobot_roborecover.datasets.schema import (
     SCHEMA,
     SCHEMA_VERSION,
     check_limits,
+    check_set,
     counts,
 )
-from lerobot_roborecover.datasets.write import check_set
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Fingerprint, Pose, Reset, Scenario, ScenarioError, Task
 

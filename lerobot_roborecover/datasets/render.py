@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from lerobot_roborecover.datasets.episodes import render_prefix, write_lerobot_dataset
+from lerobot_roborecover.datasets.episodes import render_prefix
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import LastFrames, last_frames
 from lerobot_roborecover.datasets.schema import FOLDER
@@ -121,6 +121,8 @@ def _render_shard(begin: int, scenarios: Sequence[Scenario], path: Path, episode
     last: list[LastFrames] = []
     with atomic_dir(path) as folder:
         if episodes:
+            from lerobot_roborecover.datasets.encoding import write_lerobot_dataset
+
             drawn = (render_prefix(simulator, scenario, last) for scenario in scenarios)
             write_lerobot_dataset(folder, scenarios, drawn, round(simulator.control_hz), first_index=begin)
         else:

@@ -226,6 +226,33 @@ def check_frame(where: str, frame: object) -> None:
         raise ScenarioError(f"{where} is {width} x {height} pixels; the limit is {MAX_FRAME_SIDE} a side")
 
 
+def check_set(scenarios: Sequence[Scenario]) -> None:
+    """Checks what a set needs beyond each scenario's own validity.
+
+    Raises:
+        ScenarioError: the set is empty or too large, an id occurs twice, or there is more than one platform.
+    """
+    if not scenarios:
+        raise ScenarioError("there are no scenarios; a dataset needs at least one")
+    if len(scenarios) > MAX_SCENARIOS:
+        raise ScenarioError(
+            f"{len(scenarios)} scenarios; the limit of one dataset is {MAX_SCENARIOS}. Split it"
+        )
+    first: dict[str, int] = {}
+    for row, scenario in enumerate(scenarios):
+        if scenario.id in first:
+            raise ScenarioError(
+                f"row {row}, field id: {scenario.id!r} is also the id of row {first[scenario.id]}; "
+                "ids are unique in a dataset. Rename one"
+            )
+        first[scenario.id] = row
+        if scenario.platform != scenarios[0].platform:
+            raise ScenarioError(
+                f"row {row} (scenario {scenario.id}), field platform: {scenario.platform!r}, but row 0 is "
+                f"{scenarios[0].platform!r}; a dataset holds one platform. Write one dataset a platform"
+            )
+
+
 def counts(scenarios: Iterable[Scenario]) -> dict[str, Any]:
     """Number of scenarios, and the numbers by split, suite, cell and source, as the manifest holds them."""
     scenarios = list(scenarios)

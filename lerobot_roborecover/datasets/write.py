@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -15,22 +15,24 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_roborecover._version import __version__
+from lerobot_roborecover.datasets.episodes import render_prefix
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, write_frames
 from lerobot_roborecover.datasets.frames import LastFrames
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
     MANIFEST_FILE,
     MAX_PARQUET_BYTES,
-    MAX_SCENARIOS,
     RESET_OPTIONS,
     SCENARIOS_FILE,
     SCHEMA,
     SCHEMA_VERSION,
+    check_set,
     counts,
     package_versions,
     to_row,
 )
 from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
+from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_file, atomic_write, remove_stale
 
@@ -81,6 +83,45 @@ def write_scenarios(
     else:
         _write_dataset(root, scenarios, description, license, episodes, fps, frames)
     return root
+
+
+def write_episodes(
+    root: str | os.PathLike[str],
+    scenarios: Sequence[Scenario],
+    simulator_factory: Callable[[], Simulator],
+    *,
+    fps: int | None = None,
+    description: str = "",
+    license: str | None = None,
+) -> Path:
+    """Renders every scenario's prefix and writes the complete dataset: episodes and `meta/roborecover/`.
+
+    Args:
+        root: the dataset's folder; must be new or empty.
+        scenarios: of one platform, each with a prefix of at least one action.
+        simulator_factory: makes the simulator that renders; its observation options decide the features.
+        fps: frame rate of the episodes; the simulator's control rate by default.
+        description: free text for the manifest.
+        license: SPDX identifier, or None where none is decided.
+
+    Raises:
+        ScenarioError: the folder is not empty, a prefix is, or the set is invalid.
+        SimulatorError: a scenario cannot be replayed.
+    """
+    simulator = simulator_factory()
+    last: list[LastFrames] = []
+    try:
+        return write_scenarios(
+            root,
+            scenarios,
+            description=description,
+            license=license,
+            episodes=(render_prefix(simulator, scenario, last) for scenario in scenarios),
+            frames=last,
+            fps=fps or round(simulator.control_hz),
+        )
+    finally:
+        simulator.close()
 
 
 def replace_scenarios(
@@ -145,40 +186,14 @@ def _write_dataset(
     fps: int | None,
     frames: Iterable[LastFrames],
 ) -> None:
-    from lerobot_roborecover.datasets.episodes import write_lerobot_dataset
+    # LeRobot comes in with it.
+    from lerobot_roborecover.datasets.encoding import write_lerobot_dataset
 
     if fps is None:
         raise ScenarioError("episodes need a frame rate; pass fps, e.g. the simulator's control_hz")
     with atomic_dir(root) as folder:
         write_lerobot_dataset(folder, scenarios, episodes, fps)
         _write_folder(folder / FOLDER, scenarios, description, license, frames)
-
-
-def check_set(scenarios: Sequence[Scenario]) -> None:
-    """Checks what a set needs beyond each scenario's own validity.
-
-    Raises:
-        ScenarioError: the set is empty or too large, an id occurs twice, or there is more than one platform.
-    """
-    if not scenarios:
-        raise ScenarioError("there are no scenarios; a dataset needs at least one")
-    if len(scenarios) > MAX_SCENARIOS:
-        raise ScenarioError(
-            f"{len(scenarios)} scenarios; the limit of one dataset is {MAX_SCENARIOS}. Split it"
-        )
-    first: dict[str, int] = {}
-    for row, scenario in enumerate(scenarios):
-        if scenario.id in first:
-            raise ScenarioError(
-                f"row {row}, field id: {scenario.id!r} is also the id of row {first[scenario.id]}; "
-                "ids are unique in a dataset. Rename one"
-            )
-        first[scenario.id] = row
-        if scenario.platform != scenarios[0].platform:
-            raise ScenarioError(
-                f"row {row} (scenario {scenario.id}), field platform: {scenario.platform!r}, but row 0 is "
-                f"{scenarios[0].platform!r}; a dataset holds one platform. Write one dataset a platform"
-            )
 
 
 def file_sha256(path: Path) -> str:

@@ -23,8 +23,8 @@ from lerobot_roborecover.curation.screen.dataset import validate_next
 from lerobot_roborecover.curation.validate.dataset import reject_next
 from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
-from lerobot_roborecover.datasets.episodes import write_episodes
 from lerobot_roborecover.datasets.video_frames import check_frames
+from lerobot_roborecover.datasets.write import write_episodes
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError

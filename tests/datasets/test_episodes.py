@@ -14,11 +14,10 @@ from lerobot_roborecover.datasets.episodes import (
     SCENARIO_INDEX,
     render_prefix,
     to_frame,
-    write_episodes,
 )
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import camera_pictures, last_frames
-from lerobot_roborecover.datasets.write import write_scenarios
+from lerobot_roborecover.datasets.write import write_episodes, write_scenarios
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError

@@ -164,7 +164,7 @@ def test_caches_are_left_out_and_valid_files_pass(local):
 def test_a_dataset_with_episodes_is_published_for_lerobot_and_pulled_whole(hub, client, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_roborecover.datasets.episodes import write_episodes
+    from lerobot_roborecover.datasets.write import write_episodes
     from lerobot_roborecover.platforms import make_simulator
 
     def camera():

@@ -139,7 +139,7 @@ def test_lerobot_s_viewer_shows_scenario_and_trajectory_datasets(donors, tmp_pat
     from pathlib import Path
 
     pytest.importorskip("rerun", reason="no rerun: pip install 'lerobot_env_roborecover[viz]'")
-    from lerobot_roborecover.datasets.episodes import write_episodes
+    from lerobot_roborecover.datasets.write import write_episodes
 
     def camera():
         return make_simulator("fake", obs_type="pixels_agent_pos", observation_size=64)
