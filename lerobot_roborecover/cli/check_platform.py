@@ -28,10 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the checks, a line each as they end; 0 when none failed, 1 otherwise."""
-    from lerobot_roborecover.doctor.report import check_lines, count_line, report_json
     from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.platforms import platform_named
     from lerobot_roborecover.platforms.check import TASKS, CheckRequest, check_platform
+    from lerobot_roborecover.platforms.findings import check_lines, count_line, report_json
     from lerobot_roborecover.platforms.names import choose_tasks
 
     if not 2 <= args.steps <= 100_000:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 from lerobot_roborecover.doctor.machine import check_cores, check_disk, check_gpu, check_opengl
-from lerobot_roborecover.doctor.report import format_report, report_json
 from lerobot_roborecover.doctor.software import (
     check_ffmpeg,
     check_opencv,
@@ -15,7 +14,7 @@ from lerobot_roborecover.doctor.software import (
 )
 from lerobot_roborecover.doctor.sources import check_hub, recorded_by
 from lerobot_roborecover.platforms import all_platforms, platform_named
-from lerobot_roborecover.platforms.findings import Check, Status
+from lerobot_roborecover.platforms.findings import Check, Status, format_report, report_json
 from lerobot_roborecover.platforms.probe import run_probe
 
 _LEROBOT_TIMEOUT_S = 180.0

@@ -13,8 +13,8 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
-from lerobot_roborecover.evaluation.check_findings import Finding, failure, ok, warning
 from lerobot_roborecover.evaluation.check_numbers import Stats, statistics_problem
+from lerobot_roborecover.platforms.findings import Check, failure, ok, warning
 from lerobot_roborecover.policies.load_problems import other_action_width
 
 PAPER_HORIZON: Mapping[tuple[str, str], int] = {
@@ -47,7 +47,7 @@ def _side(name: str) -> str:
     return found[0].lower() if len(found) == 1 else ""
 
 
-def check_camera_names(cameras: Mapping[str, str]) -> Finding:
+def check_camera_names(cameras: Mapping[str, str]) -> Check:
     """Cameras that go to a policy's input of another kind.
 
     Args:
@@ -79,7 +79,7 @@ def check_camera_names(cameras: Mapping[str, str]) -> Finding:
 
 def check_features(
     wanted: Mapping[str, Any], given: Mapping[str, tuple[int, ...]], kind: str, renamed: bool
-) -> Finding:
+) -> Check:
     """The policy's inputs against what the env gives.
 
     Args:
@@ -124,7 +124,7 @@ def check_features(
     return ok("inputs", f"{len(wanted)} features present")
 
 
-def check_action_width(saved: PreTrainedConfig, width: int) -> Finding:
+def check_action_width(saved: PreTrainedConfig, width: int) -> Check:
     """The checkpoint's own action width against the env's; LeRobot cuts or pads without a word.
 
     Args:
@@ -154,7 +154,7 @@ def statistics_of(pipeline: Any) -> tuple[dict[str, Stats], dict[FeatureType, No
     return {}, {}
 
 
-def check_statistics(pre: Any, post: Any, wanted: Mapping[str, Any], width: int) -> Finding:
+def check_statistics(pre: Any, post: Any, wanted: Mapping[str, Any], width: int) -> Check:
     """Whether states and actions can be normalised as the checkpoint says they are.
 
     Args:
@@ -187,7 +187,7 @@ def check_statistics(pre: Any, post: Any, wanted: Mapping[str, Any], width: int)
     return ok("normalisation", ", ".join(modes) or "none: values go to the policy as they are")
 
 
-def check_weights(policy: torch.nn.Module, path: str) -> Finding:
+def check_weights(policy: torch.nn.Module, path: str) -> Check:
     """Whether the model holds the checkpoint's numbers: LeRobot's π0 and π0.5 go on with random weights when
     theirs cannot be read (`modeling_pi05.from_pretrained`, "Returning model without loading").
 
@@ -241,7 +241,7 @@ def _weights_file(path: str) -> Path | None:
     return Path(cached) if isinstance(cached, str) else None
 
 
-def check_horizon(config: PreTrainedConfig, platform: str, shortest: int) -> Finding:
+def check_horizon(config: PreTrainedConfig, platform: str, shortest: int) -> Check:
     """How much of a chunk is executed without looking.
 
     Args:

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lerobot_roborecover.evaluation.check_findings import Finding, failure, ok, warning
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.findings import Check, failure, ok, warning
 
 type Stats = Mapping[str, np.ndarray]
 """Of one feature: `mean`, `std`, `min`, `max`, `q01`, `q99`, as far as a checkpoint has them."""
@@ -66,7 +66,7 @@ def statistics_problem(stats: Stats | None, needed: Sequence[str], width: int) -
     return ""
 
 
-def check_states(states: np.ndarray, stats: Stats | None, platform: str) -> Finding:
+def check_states(states: np.ndarray, stats: Stats | None, platform: str) -> Check:
     """Robot states of the first steps against those of the training data.
 
     Args:
@@ -123,7 +123,7 @@ def other_axis_angle(rotations: np.ndarray) -> np.ndarray:
     return axes * (angles - 2 * np.pi)
 
 
-def check_recorded_actions(recorded: np.ndarray, stats: Stats | None) -> Finding:
+def check_recorded_actions(recorded: np.ndarray, stats: Stats | None) -> Check:
     """Recorded prefixes against the actions that the checkpoint was trained on.
 
     Args:
@@ -156,7 +156,7 @@ def check_recorded_actions(recorded: np.ndarray, stats: Stats | None) -> Finding
     return ok(name, value)
 
 
-def check_gripper(recorded: np.ndarray, stats: Stats | None, columns: Sequence[int], turned: bool) -> Finding:
+def check_gripper(recorded: np.ndarray, stats: Stats | None, columns: Sequence[int], turned: bool) -> Check:
     """Whether the checkpoint's gripper commands run the way of the simulator's.
 
     Args:
@@ -192,7 +192,7 @@ def check_gripper(recorded: np.ndarray, stats: Stats | None, columns: Sequence[i
     return ok(name, "converted by a processor" if turned else "range and sign as in the recorded prefixes")
 
 
-def check_executed(actions: np.ndarray, platform: str) -> Finding:
+def check_executed(actions: np.ndarray, platform: str) -> Check:
     """Actions of the first steps, as they were sent to the simulator.
 
     Args:
@@ -216,7 +216,7 @@ def check_executed(actions: np.ndarray, platform: str) -> Finding:
     return ok(name, value)
 
 
-def check_upright(seen: np.ndarray, upright: np.ndarray, key: str) -> Finding:
+def check_upright(seen: np.ndarray, upright: np.ndarray, key: str) -> Check:
     """Whether a picture reaches the policy the way LeRobot's data has it.
 
     Args:
@@ -239,7 +239,7 @@ def check_upright(seen: np.ndarray, upright: np.ndarray, key: str) -> Finding:
     return ok(name, "upright" if as_seen > 0.9 else f"as the camera gives it (correlation {as_seen:.2f})")
 
 
-def check_cameras_by_colour(colours: Mapping[str, np.ndarray], stats: Mapping[str, Stats]) -> Finding | None:
+def check_cameras_by_colour(colours: Mapping[str, np.ndarray], stats: Mapping[str, Stats]) -> Check | None:
     """Whether two cameras look more like each other's training pictures than like their own.
 
     Args:

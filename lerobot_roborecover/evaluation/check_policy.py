@@ -22,19 +22,19 @@ from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation import check_names as names
 from lerobot_roborecover.evaluation import check_numbers as numbers
-from lerobot_roborecover.evaluation.check_findings import (
-    Finding,
-    failure,
-    findings_json,
-    format_findings,
-    ok,
-    warning,
-)
 from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scenario, take_steps
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms.findings import (
+    Check,
+    failure,
+    format_report,
+    ok,
+    report_json,
+    warning,
+)
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
@@ -76,11 +76,11 @@ def check(cfg: CheckPolicyConfig) -> int:
         raise OptionError(f"--check.steps={cfg.check.steps}: must be from 1 to 1000")
     with redirect_stdout(sys.stderr):  # LeRobot's loaders print
         findings = examine(cfg)
-    print(json.dumps(findings_json(findings), indent=2) if cfg.check.json else format_findings(findings))
-    return int(not findings_json(findings)["ok"])
+    print(json.dumps(report_json(findings), indent=2) if cfg.check.json else format_report(findings))
+    return int(not report_json(findings)["ok"])
 
 
-def examine(cfg: CheckPolicyConfig) -> list[Finding]:
+def examine(cfg: CheckPolicyConfig) -> list[Check]:
     """All checks; those that need what an earlier one did not get are left out.
 
     Args:
@@ -119,12 +119,12 @@ def examine(cfg: CheckPolicyConfig) -> list[Finding]:
         findings.append(names.check_horizon(config, run.pool.config.platform, min(horizons)))
         scenario = min(scenarios, key=lambda s: len(s.prefix))
         start = hand_off_scenario(run, scenario)
-        if isinstance(start, Finding):
+        if isinstance(start, Check):
             return [*findings, start]
         if own is not None:
             findings += _look(cfg, own, run, scenarios, scenario, start)
         steps = take_steps(watched, run, scenario, start, seed=cfg.seed, steps=cfg.check.steps)
-        if isinstance(steps, Finding):
+        if isinstance(steps, Check):
             return [*findings, steps]
         findings.append(numbers.check_executed(steps.actions, run.pool.config.platform))
         if own is not None:
@@ -158,7 +158,7 @@ def _cameras(cfg: CheckPolicyConfig) -> dict[str, str]:
     return found
 
 
-def _not_loaded(err: Exception) -> Finding:
+def _not_loaded(err: Exception) -> Check:
     text = f"{type(err).__name__}: {err}".splitlines()[0]
     remedy = load_remedy(err) or "see the message; 'roborecover doctor' checks what is installed"
     return failure("loads", text, "a policy with its processors", remedy)
@@ -171,7 +171,7 @@ def _look(
     scenarios: ScenarioSet,
     scenario: Scenario,
     start: EpisodeStart,
-) -> list[Finding]:
+) -> list[Check]:
     """Inputs, pictures and recorded actions, before the policy is asked for anything."""
     _, pre, post = host.parts
     config = cfg.given_policy
@@ -216,7 +216,7 @@ def _look(
     return found
 
 
-def _check_states(host: LocalPolicyRunner, scenario: Scenario, steps: FirstSteps, platform: str) -> Finding:
+def _check_states(host: LocalPolicyRunner, scenario: Scenario, steps: FirstSteps, platform: str) -> Check:
     batch = host.env_batch(steps.observations, [scenario.task.instruction] * len(steps.observations))
     key = "observation.state"
     if key not in batch:
@@ -225,9 +225,7 @@ def _check_states(host: LocalPolicyRunner, scenario: Scenario, steps: FirstSteps
     return numbers.check_states(batch[key].float().cpu().numpy(), stats.get(key), platform)
 
 
-def _check_trials(
-    cfg: CheckPolicyConfig, host: PolicyRunner, scenario: Scenario, observation: dict
-) -> Finding:
+def _check_trials(cfg: CheckPolicyConfig, host: PolicyRunner, scenario: Scenario, observation: dict) -> Check:
     """Whether several trials of a scenario are several trials."""
     answers = []
     for trial in range(2):
@@ -254,7 +252,7 @@ def _check_trials(
 
 def _estimate(
     cfg: CheckPolicyConfig, host: PolicyRunner, scenarios: ScenarioSet, scenario: Scenario, steps: FirstSteps
-) -> list[Finding]:
+) -> list[Check]:
     """Inference time, alone and in a batch, and how long the whole evaluation would take at most."""
     room = default_slots(str(cfg.given_policy.device), usable_cores(), available_gb())
     slots = min(cfg.runner.slots or room, len(scenarios) * cfg.eval.n_episodes)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.evaluation.check_findings import Finding, failure
 from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.platforms.findings import Check, failure
 from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
 from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner
 from lerobot_roborecover.scenario import Scenario
@@ -30,7 +30,7 @@ class FirstSteps:
     """Of the simulator, observation included."""
 
 
-def hand_off_scenario(run: EvalSession, scenario: Scenario) -> EpisodeStart | Finding:
+def hand_off_scenario(run: EvalSession, scenario: Scenario) -> EpisodeStart | Check:
     """Hands a scenario off in the real simulator; what is wrong, where it cannot be."""
     slot = run.pool.slots(1)[0]
     protocol = run.protocol
@@ -60,7 +60,7 @@ def take_steps(
     *,
     seed: int | None,
     steps: int,
-) -> FirstSteps | Finding:
+) -> FirstSteps | Check:
     """A few steps, one action at a time, so that every observation is seen."""
     slot = run.pool.slots(1)[0]
     observations, actions, infer_s, step_s = [start.observation], [], [], []
@@ -106,7 +106,7 @@ def take_steps(
     return FirstSteps(observations, np.stack(actions), infer_s, start.handoff.seconds, step)
 
 
-def _refused(problem: str, width: int) -> Finding:
+def _refused(problem: str, width: int) -> Check:
     return failure(
         "actions", problem, f"{width} finite values",
         "such an action is never sent to the simulator; every trial would be a policy_error. Check the "

@@ -11,9 +11,8 @@ import pytest
 from lerobot_roborecover import doctor
 from lerobot_roborecover.cli import main as cli
 from lerobot_roborecover.doctor import machine, software, sources
-from lerobot_roborecover.doctor.report import format_report, report_json
 from lerobot_roborecover.platforms import probe, versions
-from lerobot_roborecover.platforms.findings import Check, Status
+from lerobot_roborecover.platforms.findings import Check, Status, format_report, report_json
 from lerobot_roborecover.platforms.libero import PLATFORM
 from tests.support.processes import PATIENCE_S
 
@@ -226,6 +225,8 @@ def test_report_as_json():
         "name": "Hub",
         "status": "warning",
         "detail": "does not answer",
+        "value": "does not answer",
+        "expected": "",
         "remedy": "check the network",
     }
 

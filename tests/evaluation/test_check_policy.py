@@ -38,7 +38,7 @@ def test_states():
         return numbers.check_states(np.atleast_2d(states), stats, platform)
 
     assert check(UPRIGHT).status is Status.OK
-    assert "not checked" in check(UPRIGHT, None).value
+    assert "not checked" in check(UPRIGHT, None).detail
     strayed = UPRIGHT + 0.9 * np.eye(8)[2]
     assert check(strayed).status is Status.WARNING, "one value off is what a recovery point may be"
     joints = np.array([0.0, -3.0, 9.0, -2.4, 8.0, 6.2, 5.8, 5.0])
@@ -105,7 +105,7 @@ def test_pictures():
     assert numbers.check_upright(seen, upright, "c").status is Status.OK
     turned = numbers.check_upright(seen[:, ::-1, ::-1], upright, "c")
     assert turned.status is Status.FAILURE
-    assert turned.value == "upside down"
+    assert turned.detail == "upside down"
 
 
 def test_cameras_that_look_like_each_other():
