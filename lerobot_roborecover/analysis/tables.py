@@ -12,6 +12,7 @@ from typing import Literal
 from lerobot_roborecover.analysis.escape import csv_text, latex, markdown
 from lerobot_roborecover.analysis.stats.estimators import UNDERPOWERED_BELOW
 from lerobot_roborecover.analysis.stats.intervals import Estimate
+from lerobot_roborecover.utils.text import align
 
 Kind = Literal["text", "percent", "points", "ratio", "count", "number", "p"]
 Cell = str | int | float | Estimate | None
@@ -209,15 +210,5 @@ def to_text(table: Table) -> str:
     """Plain text for a terminal: aligned columns and notes."""
     table = table.shown()
     rows = [[column.title for column in table.columns], *table.texts()]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
-    return "\n".join(_aligned(row, widths, table.columns) for row in rows) + "".join(
-        f"\n{note}" for note in table.all_notes()
-    )
-
-
-def _aligned(row: Sequence[str], widths: Sequence[int], columns: Sequence[Column]) -> str:
-    cells = [
-        f"{cell:<{width}}" if column.kind == "text" else f"{cell:>{width}}"
-        for cell, width, column in zip(row, widths, columns, strict=True)
-    ]
-    return "  ".join(cells).rstrip()
+    left = [i for i, column in enumerate(table.columns) if column.kind == "text"]
+    return "\n".join([*align(rows, left), *table.all_notes()])

@@ -73,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.detection.data.choice import TRAIN, DataOptions
     from lerobot_roborecover.detection.data.request import MonitorRequest, make_monitor_data
     from lerobot_roborecover.utils.progress import Progress
+    from lerobot_roborecover.utils.text import align
 
     datasets.disable_progress_bars()  # LeRobot's writer shows one per episode
     choice = DataOptions(
@@ -104,10 +105,15 @@ def run(args: argparse.Namespace) -> int:
         license=args.license,
     )
     made = make_monitor_data(request, Progress("frame").of)
-    print(f"{'':22}{'IDs':>7}{'traj.':>8}{'frames':>9}{'label 0':>9}{'label 1':>9}")
-    for part, c in made.counts.items():
-        numbers = (c["ids"], c["trajectories"], c["frames"], c["label0"], c["label1"])
-        print(f"{part:22}{numbers[0]:7}{numbers[1]:8}{numbers[2]:9}{numbers[3]:9}{numbers[4]:9}")
+    columns = {
+        "ids": "IDs",
+        "trajectories": "traj.",
+        "frames": "frames",
+        "label0": "label 0",
+        "label1": "label 1",
+    }
+    rows = [[part, *(c[name] for name in columns)] for part, c in made.counts.items()]
+    print("\n".join(align([["", *columns.values()], *rows])))
     for reason, n in made.dropped.most_common():
         print(f"left out {n}: {reason}")
     if TRAIN in made.counts:

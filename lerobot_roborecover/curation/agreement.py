@@ -27,6 +27,7 @@ from lerobot_roborecover.analysis.stats.intervals import (
     spread,
 )
 from lerobot_roborecover.curation.annotation.votes import Vote
+from lerobot_roborecover.utils.text import align
 
 NAN = Estimate(float("nan"), float("nan"), float("nan"))
 
@@ -242,11 +243,12 @@ def format_agreement(rows: Sequence[Agreement]) -> str:
             return value
         return f"{value} [{scale * estimate.low:.{digits}f}, {scale * estimate.high:.{digits}f}]"
 
-    head = f"{'axis':<7}{'episodes':>9}  {'pairs %':<23}{'all agree %':<23}{'Fleiss kappa':<23}Kripp. alpha"
-    lines = [head]
-    for row in rows:
-        lines.append(
-            f"{row.axis:<7}{row.episodes:>9}  {cell(row.pairs, 100, 1):<23}{cell(row.unanimous, 100, 1):<23}"
-            f"{cell(row.kappa, 1, 3):<23}{cell(row.alpha, 1, 3)}".rstrip()
+    head = ("axis", "episodes", "pairs %", "all agree %", "Fleiss kappa", "Kripp. alpha")
+    cells = [
+        (
+            row.axis, row.episodes, cell(row.pairs, 100, 1), cell(row.unanimous, 100, 1),
+            cell(row.kappa, 1, 3), cell(row.alpha, 1, 3),
         )
-    return "\n".join(lines)
+        for row in rows
+    ]  # fmt: skip
+    return "\n".join(align([head, *cells], left=(0, 2, 3, 4, 5)))

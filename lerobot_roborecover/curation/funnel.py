@@ -20,6 +20,7 @@ from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_file
 from lerobot_roborecover.utils.journal import Journal, read_journal
+from lerobot_roborecover.utils.text import align
 
 DECISIONS_FILE = "decisions.jsonl"
 SCHEMA_VERSION = 1
@@ -151,12 +152,12 @@ def count_stages(decisions: Sequence[Decision]) -> list[StageCounts]:
 
 def attrition_table(rows: Sequence[StageCounts]) -> str:
     """The table as text, one line a stage and one a reason."""
-    lines = [f"{'stage':<10}{'entered':>9}{'kept':>9}{'dropped':>9}{'undecided':>11}"]
+    cells: list[tuple[object, ...]] = [("stage", "entered", "kept", "dropped", "undecided", "")]
     for row in rows:
         dropped = sum(n for _, n in row.dropped)
-        lines.append(f"{row.stage:<10}{row.entered:>9}{row.kept:>9}{dropped:>9}{row.undecided:>11}")
-        lines += [f"{'':<10}{'':>18}{n:>9}  {reason}" for reason, n in row.dropped]
-    return "\n".join(lines)
+        cells.append((row.stage, row.entered, row.kept, dropped, row.undecided, ""))
+        cells += [("", "", "", n, "", reason) for reason, n in row.dropped]
+    return "\n".join(align(cells, left=(0, 5)))
 
 
 def _said(decision: Decision) -> tuple[str, str, str]:

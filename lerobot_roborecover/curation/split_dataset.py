@@ -28,7 +28,7 @@ from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
-from lerobot_roborecover.utils.text import next_command, pluralize
+from lerobot_roborecover.utils.text import align, next_command, pluralize
 
 SPLIT_FILE = "split.json"
 SCHEMA_VERSION = 1
@@ -161,13 +161,12 @@ def format_report(report: SplitReport) -> str:
     lines = [
         f"{pluralize(sum(report.counts.values()), 'scenario')} in {pluralize(report.groups, 'group')}, "
         f"the largest of {report.largest_group}; kept apart: {', '.join(report.apart)}",
-        f"{'':<34}" + "".join(f"{name:>10}" for name in names),
-        f"{'scenarios':<34}" + "".join(f"{report.counts[name]:>10}" for name in names),
     ]
+    rows: list[list[object]] = [["", *names], ["scenarios", *(report.counts[name] for name in names)]]
     for axis, values in report.balance.items():
-        lines.append(axis)
-        for value, counts in values.items():
-            lines.append(f"  {value[:32]:<32}" + "".join(f"{counts.get(name, 0):>10}" for name in names))
+        rows.append([axis, *("" for _ in names)])
+        rows += [[f"  {v[:32]}", *(counts.get(name, 0) for name in names)] for v, counts in values.items()]
+    lines += align(rows)
     for key in report.apart:
         found = report.leaks.get(key, ())
         lines.append(f"leakage by {key}: {len(found) or 'none'}")

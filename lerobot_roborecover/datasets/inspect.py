@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from lerobot_roborecover.platforms.robot_fingerprint import NAME, is_robot_entry
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.stepping import iter_steps
 from lerobot_roborecover.scenario import DeviationType, Pose, Scenario, ScenarioError, Stage
-from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.utils.text import align, pluralize
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,13 @@ def summary(found: ScenarioSet) -> str:
         counts = Counter((key(s), s.split) for s in scenarios)
         values = sorted({value for value, _ in counts})
         rows = [
-            [v, *(counts[v, split] for split in splits), sum(counts[v, s] for s in splits)] for v in values
+            [v[:48], *(counts[v, split] for split in splits), sum(counts[v, s] for s in splits)]
+            for v in values
         ]
-        lines += ["", *_table([label, *splits, "all"], rows)]
+        lines += ["", *align([[label, *splits, "all"], *rows])]
     counts = Counter((s.stage, s.deviation) for s in scenarios)
     rows = [[stage.value, *(counts[stage, kind] or "-" for kind in DeviationType)] for stage in Stage]
-    lines += ["", *_table(["stage", *(kind.value for kind in DeviationType)], rows)]
+    lines += ["", *align([["stage", *(kind.value for kind in DeviationType)], *rows])]
     versions = _in_short(package_versions(scenarios))
     lines += ["", *(f"{name} {', '.join(values)}" for name, values in versions.items())]
     return "\n".join(lines)
@@ -223,15 +224,3 @@ class _Recording:
     def close(self) -> None:
         self._stream.flush()
         self._stream.disconnect()
-
-
-def _table(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Aligned lines: the first column to the left, the others to the right."""
-    cells = [[str(c)[:48] for c in row] for row in (header, *rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
-    return [
-        "  ".join(
-            c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in cells
-    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 # tqdm's, with and without a total; other output may begin right behind one.
 _PROGRESS_BAR = re.compile(r"[^\r\n]*?(?:\d+%\|[^\r\n]*?|\b\d+it )\[[^\]\r\n]*\]")
@@ -33,6 +33,24 @@ def next_command(argv: Sequence[str], what: str = "next") -> str:
         what: the line's beginning.
     """
     return f"{what}: roborecover {shlex.join(argv)}"
+
+
+def align(rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> list[str]:
+    """A table for the terminal, a line a row, columns two spaces apart.
+
+    Args:
+        rows: of equal length, the heading among them.
+        left: columns that begin below each other; the others, numbers, end below each other.
+    """
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
 
 
 def format_duration(seconds: float) -> str:

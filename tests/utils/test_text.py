@@ -1,10 +1,10 @@
-"""What is shown of the output of a program that failed."""
+"""What is shown of the output of a program that failed, and tables for the terminal."""
 
 from __future__ import annotations
 
 import pytest
 
-from lerobot_roborecover.utils.text import output_end
+from lerobot_roborecover.utils.text import align, output_end
 
 BAR = "Stepping through eval batches:  {n:2}%|##   | {n}/100 [00:01<00:09,  9.9it/s]"
 BARS = "\r".join(BAR.format(n=n) for n in range(60))
@@ -33,3 +33,10 @@ def test_the_end_of_an_output_is_its_cause_and_no_progress_bars(output, cause, s
 
 def test_only_so_many_lines_are_shown():
     assert output_end("OSError: full\n1\n2\n3\n", 2) == ("OSError: full", "  2\n  3")
+
+
+def test_a_table_is_aligned_and_has_no_blanks_at_its_end():
+    rows = [("stage", "kept", ""), ("collect", 12, "stuck"), ("agree", 3, "")]
+    assert align(rows, left=(0, 2)) == ["stage    kept", "collect    12  stuck", "agree       3"]
+    assert align([("a", 1), ("b", 20)], left=()) == ["a   1", "b  20"]
+    assert align([]) == []

@@ -9,6 +9,7 @@ import numpy as np
 from lerobot_roborecover.platforms import all_platforms, platform_named
 from lerobot_roborecover.platforms.base import Controller
 from lerobot_roborecover.scenario import ScenarioError, Task
+from lerobot_roborecover.utils.text import align
 
 
 def make_controller(name: str, simulator: Any, task: Task, rng: np.random.Generator) -> Controller:
@@ -42,10 +43,13 @@ def check_expert(platform: str, name: str) -> None:
 
 def list_experts(platform: str = "") -> str:
     """The scripted controllers of a platform, or of every one, a line each."""
-    lines = [
-        f"{found.name:<12}{name:<24}{expert.about}"
+    rows = [
+        (found.name, name, expert.about)
         for found in all_platforms()
         for name, expert in found.experts.items()
         if platform in ("", found.name)
     ]
-    return "\n".join(lines) or f"{platform} has no scripted controller here; use --policy.path=CHECKPOINT"
+    return (
+        "\n".join(align(rows, left=(0, 1, 2)))
+        or f"{platform} has no scripted controller here; use --policy.path=CHECKPOINT"
+    )

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_roborecover.curation.screen.screening import PolicyCount, Screened, ScreenRule
+from lerobot_roborecover.utils.text import align
 
 _BAR = 40
 
@@ -37,11 +38,8 @@ def format_settled(found: Sequence[Screened]) -> str:
     successes are not complete."""
     run = Counter((sum(c.trials for c in s.counts.values()), s.decision.reason or "stays") for s in found)
     reasons = sorted({reason for _, reason in run}, key=lambda reason: (reason != "stays", reason))
-    lines = ["  ".join([f"{'trials':>9}", *(f"{reason:>9}" for reason in reasons)])]
-    for trials in sorted({trials for trials, _ in run}):
-        cells = (f"{run[trials, reason]:>{max(9, len(reason))}}" for reason in reasons)
-        lines.append("  ".join([f"{trials:>9}", *cells]))
-    return "\n".join(lines)
+    counts = [[n, *(run[n, reason] for reason in reasons)] for n in sorted({trials for trials, _ in run})]
+    return "\n".join(align([["trials", *reasons], *counts], left=()))
 
 
 def format_policies(found: Sequence[Screened]) -> str:
@@ -53,14 +51,12 @@ def format_policies(found: Sequence[Screened]) -> str:
     """
     kept = [s for s in found if s.decision.verdict == "kept"]
     names = sorted({name for s in found for name in s.counts})
-    width = max([len("policy"), *map(len, names)])
-    lines = [f"{'policy':<{width}}  {'recovered %':<21}{'of those kept %':<21}{'trials':>7}{'invalid':>9}"]
+    rows: list[tuple[object, ...]] = [("policy", "recovered %", "of those kept %", "trials", "invalid")]
     for name in names:
         counts = [s.counts[name] for s in found]
         trials, invalid = (sum(ns) for ns in ([c.trials for c in counts], [*map(_invalid, counts)]))
-        cells = f"{_rate(found, name):<21}{_rate(kept, name):<21}"
-        lines.append(f"{name:<{width}}  {cells}{trials:>7}{invalid:>9}")
-    return "\n".join(lines)
+        rows.append((name, _rate(found, name), _rate(kept, name), trials, invalid))
+    return "\n".join(align(rows, left=(0, 1, 2)))
 
 
 def _invalid(count: PolicyCount) -> int:

@@ -26,6 +26,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.funnel import Decision, VerdictName
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Pose, Scenario, ScenarioError
+from lerobot_roborecover.utils.text import align
 
 PAPER_PASS_RATE = 0.9732
 CRASH, INVALID_ACTION = "simulator crash", "invalid action"
@@ -247,7 +248,6 @@ def format_validation(
     lines = [
         f"{passed} of {total} pass: {100 * passed / max(total, 1):.2f} % [{100 * low:.1f}, {100 * high:.1f}] "
         f"(paper: {100 * PAPER_PASS_RATE:.2f} %)",
-        f"{'':<36}{'median':>10}{'95 %':>10}{'worst':>10}{'limit':>10}",
     ]
     whole = [r for r in replays.values() if r.runs and not r.error]
     rows: list[tuple[str, list[float], float, bool]] = [
@@ -262,11 +262,12 @@ def format_validation(
     ]
     if rule.frames:
         rows.append(("mean SSIM", [r.mean_ssim for r in whole], rule.min_ssim, False))
+    cells = [["", "median", "95 %", "worst", "limit"]]
     for title, values, limit, high_is_bad in rows:
         if values:
             at = (0.5, 0.95, 1.0) if high_is_bad else (0.5, 0.05, 0.0)
-            numbers = "".join(f"{v:>10.5f}" for v in np.quantile(values, at))
-            lines.append(f"{title:<36}{numbers}{limit:>10g}")
+            cells.append([title, *(f"{v:.5f}" for v in np.quantile(values, at)), f"{limit:g}"])
+    lines += align(cells)
     same = sum(r.identical for r in whole)
     lines.append(f"state identical in all replays, bit for bit: {same} of {len(whole)}")
     if not rule.frames:
