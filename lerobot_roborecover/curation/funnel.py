@@ -152,11 +152,11 @@ def count_stages(decisions: Sequence[Decision]) -> list[StageCounts]:
 
 def attrition_table(rows: Sequence[StageCounts]) -> str:
     """The table as text, one line a stage and one a reason."""
-    cells: list[tuple[object, ...]] = [("stage", "entered", "kept", "dropped", "undecided", "")]
+    cells: list[tuple[object, ...]] = [("stage", "entered", "kept", "undecided", "dropped", "")]
     for row in rows:
         dropped = sum(n for _, n in row.dropped)
-        cells.append((row.stage, row.entered, row.kept, dropped, row.undecided, ""))
-        cells += [("", "", "", n, "", reason) for reason, n in row.dropped]
+        cells.append((row.stage, row.entered, row.kept, row.undecided, dropped, ""))
+        cells += [("", "", "", "", n, reason) for reason, n in row.dropped]
     return "\n".join(align(cells, left=(0, 5)))
 
 
