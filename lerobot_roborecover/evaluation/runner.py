@@ -2,7 +2,6 @@
 
 import json
 import logging
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from lerobot_roborecover.evaluation.loading import HostSpec, load_host
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
-from lerobot_roborecover.evaluation.videos import VideoRecorder
+from lerobot_roborecover.evaluation.videos import SAMPLE, VideoRecorder, video_trial
 from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue, units_of
 from lerobot_roborecover.logs.extent import missing
 from lerobot_roborecover.logs.row import TrialRow
@@ -32,6 +31,7 @@ from lerobot_roborecover.logs.trial_log import check_retry
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.metadata import policy_metadata
+from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.renamed_fields import move_old_fields
 from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
@@ -66,10 +66,13 @@ class RunnerOptions:
     """How long a slot waits for company before the policy is asked for it."""
     limit_seconds: float = 0.0
     """Stop cleanly after this long; 0 does not. The same command goes on where it stopped."""
-    videos: int = 0
-    """MP4s to keep under `videos/` in the output directory, at most."""
-    videos_of: str = "failures"
-    """Of which trials: `failures`, `successes`, `all`, or comma-separated scenario ids."""
+    videos: int | None = None
+    """MP4s to keep under `videos/` in the output directory, at most (default: 4 where the environment renders
+    images, else 0)."""
+    videos_of: str = ""
+    """Of which trials: `failures` (default with a number of videos), `successes`, `all`, comma-separated
+    scenario ids, or `sample` (default without): the first trial of scenarios spread over the set, the same
+    ones for every policy."""
     render_device: str = "auto"
     """Where simulators draw: `auto` (the policy's GPU; on a Ray cluster the GPUs of a simulator's own
     machine, in turn), `cpu`, or a GPU's number."""
@@ -118,8 +121,9 @@ class RunnerOptions:
             ("videos", 0, 100_000),
             ("replicas", 0, 4096),
         ):
-            if not low <= getattr(self, name) <= high:
-                raise OptionError(f"--runner.{name}={getattr(self, name)}: must be from {low} to {high}")
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise OptionError(f"--runner.{name}={value}: must be from {low} to {high}")
 
 
 @dataclass
@@ -252,8 +256,9 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
         settled()
 
     videos, result = None, RunResult()
-    if cfg.runner.videos:
-        videos = VideoRecorder(out / "videos", cfg.runner.videos, cfg.runner.videos_of, ids)
+    if count := _video_count(cfg):
+        of = cfg.runner.videos_of or ("sample" if cfg.runner.videos is None else "failures")
+        videos = VideoRecorder(out / "videos", count, of, ids, Start(run.protocol.start))
     if watch is not None:
         watch.record(log.path)
     if not settled():
@@ -300,6 +305,12 @@ def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
     )
 
 
+def _video_count(cfg: RecoveryEvalConfig) -> int:
+    if cfg.runner.videos is None:
+        return SAMPLE if cfg.recovery_env.obs_type != "state" else 0
+    return cfg.runner.videos
+
+
 def _places(cfg: RecoveryEvalConfig) -> EngineConfig:
     env, runner = cfg.recovery_env, cfg.runner
     return EngineConfig(
@@ -307,7 +318,7 @@ def _places(cfg: RecoveryEvalConfig) -> EngineConfig:
         runner.slots,
         runner.replicas,
         str(cfg.given_policy.device),
-        env.obs_type != "state" or bool(runner.videos),
+        env.obs_type != "state" or bool(_video_count(cfg)),
         runner.render_device,
         env.snapshot_dir or None,
     )
@@ -324,8 +335,8 @@ def report(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, vi
     """
     wanted = {s.id for s in scenarios}
     rows = [r for r in run.rows() if r.scenario_id in wanted and r.trial < cfg.eval.n_episodes]
-    names = [(re.fullmatch(r"(.+)_trial(\d+)_\w+", p.stem), p) for p in videos]
-    by_trial = {(m[1], int(m[2])): str(p) for m, p in names if m}
+    names = [(video_trial(p, Start(run.protocol.start)), p) for p in videos]
+    by_trial = {name: str(p) for name, p in names if name}
     out = cfg.folder
     out.mkdir(parents=True, exist_ok=True)
     info = eval_info(rows, cfg.recovery_env.group_by, by_trial)

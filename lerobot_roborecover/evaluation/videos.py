@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import av
@@ -11,9 +12,20 @@ import numpy as np
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.work_items import WorkItem
-from lerobot_roborecover.scenario import Outcome
+from lerobot_roborecover.scenario import Outcome, Start
 
-KINDS = ("failures", "successes", "all")
+KINDS = ("failures", "successes", "all", "sample")
+SAMPLE = 4
+"""Videos that a run with images keeps when `--runner.videos` says nothing."""
+_NAME = re.compile(r"(?P<id>.+?)(_(?P<start>initial|reversion))?_trial(?P<trial>\d+)_[a-z_]+")
+
+
+def video_trial(path: Path, start: Start) -> tuple[str, int] | None:
+    """Scenario and trial number of a video; None where it is of no trial from that start."""
+    match = _NAME.fullmatch(path.stem)
+    if match is None or (match["start"] or Start.RECOVERY) != start:
+        return None
+    return match["id"], int(match["trial"])
 
 
 class VideoWriter:
@@ -62,17 +74,22 @@ class VideoRecorder:
     Args:
         folder: where videos go; those already there count.
         count: how many to keep.
-        of: `failures`, `successes`, `all`, or comma-separated scenario ids.
+        of: `failures`, `successes`, `all`, `sample`, or comma-separated scenario ids. `sample` takes the
+            first trial of scenarios spread over the run's: videos of two policies show the same scenarios.
         ids: the run's scenarios.
+        start: of the run's trials. Videos of other starts in `folder` stay and do not count.
 
     Raises:
         OptionError: `of` names neither.
     """
 
-    def __init__(self, folder: Path, count: int, of: str, ids: Iterable[str]):
-        self._folder, self._count, self._of = folder, count, of
+    def __init__(self, folder: Path, count: int, of: str, ids: Iterable[str], start: Start = Start.RECOVERY):
+        self._folder, self._count, self._of, self._start = folder, count, of, start
+        known = sorted(set(ids))
         self._ids = None if of in KINDS else {name.strip() for name in of.split(",")}
-        unknown = sorted((self._ids or set()) - set(ids))
+        if of == "sample":
+            self._ids = set(_spread(known, count))
+        unknown = sorted((self._ids or set()) - set(known))
         if unknown:
             raise OptionError(
                 f"--runner.videos_of={of}: {unknown[0]!r} is neither one of {list(KINDS)} nor a scenario of "
@@ -80,15 +97,17 @@ class VideoRecorder:
             )
         for part in folder.glob("*.part"):  # of a run that was killed
             part.unlink()
-        self.kept = sorted(folder.glob("*.mp4"))
+        self.kept = sorted(path for path in folder.glob("*.mp4") if video_trial(path, start))
 
     def wants(self, unit: WorkItem) -> bool:
         """Whether a trial might be kept."""
-        return len(self.kept) < self._count and (self._ids is None or unit.scenario.id in self._ids)
+        if len(self.kept) >= self._count or (self._of == "sample" and unit.trial > 0):
+            return False
+        return self._ids is None or unit.scenario.id in self._ids
 
     def begin(self, unit: WorkItem, frame: np.ndarray, fps: float) -> VideoWriter:
         """A recording that starts with the handoff's frame."""
-        recording = VideoWriter(self._folder / f"{unit.scenario.id}_trial{unit.trial}.part", fps)
+        recording = VideoWriter(self._folder / f"{self._stem(unit)}.part", fps)
         recording.add([frame])
         return recording
 
@@ -99,6 +118,16 @@ class VideoRecorder:
         if not fits or len(self.kept) >= self._count:
             recording.drop()
             return
-        path = self._folder / f"{unit.scenario.id}_trial{unit.trial}_{outcome.value}.mp4"
+        path = self._folder / f"{self._stem(unit)}_{outcome.value}.mp4"
         recording.keep(path)
         self.kept.append(path)
+
+    def _stem(self, unit: WorkItem) -> str:
+        start = "" if self._start is Start.RECOVERY else f"_{self._start.value}"
+        return f"{unit.scenario.id}{start}_trial{unit.trial}"
+
+
+def _spread(ids: Sequence[str], count: int) -> list[str]:
+    """At most `count` of the ids, evenly spaced."""
+    count = min(count, len(ids))
+    return [ids[k * len(ids) // count] for k in range(count)]

@@ -277,6 +277,23 @@ def test_videos_of_chosen_scenarios(run):
     assert all(name.startswith(chosen) for name in found)
 
 
+def test_a_run_with_images_has_videos_of_every_start(run):
+    """Without an option: the same scenarios for every policy; initial trials are kept beside the others."""
+    pictures = "--env.obs_type=pixels_agent_pos"
+    found = videos(run(pictures))
+    ids = sorted(fake_scenario(i).id for i in range(COUNT))
+    assert [name.split("_trial0_")[0] for name in found] == ids
+    out = run(pictures, "--env.start=initial")
+    every = videos(out)
+    assert found.items() <= every.items(), "nothing was overwritten"
+    assert [n.split("_initial_trial0_")[0] for n in sorted(set(every) - set(found))] == ids
+    info = json.loads((out / "eval_info.json").read_text())
+    paths = [p for task in info["per_task"] for p in task["metrics"]["video_paths"]]
+    assert {Path(p).name for p in paths} == set(every) - set(found)
+    assert not (run(out="state") / "videos").exists(), "a state-only run renders nothing"
+    assert not (run(pictures, "--videos=0", out="none") / "videos").exists()
+
+
 @pytest.mark.nightly
 def test_without_videos_nothing_is_rendered(run, monkeypatch, tmp_path):
     """Workers are fresh interpreters: a package ahead of ours on their path counts the renders."""
