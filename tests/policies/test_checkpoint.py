@@ -6,6 +6,8 @@ import json
 import re
 import shutil
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -187,3 +189,15 @@ def test_every_command_says_it_in_one_line(command, name, broken, scenarios, tmp
     assert last.startswith(f"roborecover {'eval' if command == 'member' else command}: ")
     assert policy in last
     assert WORDS[name] in last
+
+
+def test_eval_refuses_a_wrong_folder_before_lerobot_is_imported():
+    program = (
+        "import sys; from lerobot_roborecover.cli.main import main; "
+        "status = main(['eval', '--env', 'roborecover_libero', '--policy.path=/nowhere/at/all']); "
+        "sys.exit(status if not {'lerobot', 'torch'} & set(sys.modules) else 99)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "--policy.path=/nowhere/at/all: no LeRobot policy there: there is no such folder" in line
