@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_roborecover.cli import detect_evaluate, detect_evaluate_frames
+from lerobot_roborecover.cli.detect_evaluate import DetectOptions
+from lerobot_roborecover.cli.detect_evaluate_frames import FrameOptions
+from lerobot_roborecover.detection.options import DetectionRequest
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Measure a trained monitor on held-out frames (--monitor, --data): accuracy, precision, recall, F1, "
@@ -15,40 +19,55 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of both commands."""
-    detect_evaluate_frames.add_frame_arguments(parser, required=False)
-    add = parser.add_argument
-    add("--out", type=Path, default=Path("outputs/monitor"), help="folder of the report (%(default)s)")
-    add("--device", help="where the monitor, the policy and the detectors run")
-    add("--base-model", help="base of the Qwen3-VL monitor, where its checkpoint names another place")
-    add(
-        "--on-training-scenarios", action="store_true",
-        help="measure also on scenarios that the monitor was trained on: says nothing about others",
-    )  # fmt: skip
-    add("--draws", type=int, default=10_000, help="without effect: the intervals need no draws")
-    add("--seed", type=int, default=0, help="without effect, likewise")
-    add("--level", type=float, default=0.95, help="confidence level (%(default)s)")
-    side_by_side = parser.add_argument_group("detectors side by side")
-    # Here --num-workers are those that read frames.
-    detect_evaluate.add_detector_arguments(side_by_side, workers="--workers")
+@dataclass(frozen=True, kw_only=True)
+class EvalMonitorOptions(FrameOptions):
+    """Options of both commands."""
+
+    draws: int = 10_000
+    """Without effect: the intervals need no draws."""
+    workers: int = option(1)
+    """Processes that replay and render; --num-workers are those that read frames."""
+    side_by_side: DetectionRequest = option(factory=DetectionRequest, group="detectors side by side")
+    scores: Path | None = option(None, metavar="DIR")
+    """Run nothing: report the scores in the --out of an earlier comparison."""
+    frame_strips: int = option(3, old=("films",))
+    """Trials shown frame by frame; 0: none."""
+    work: Path | None = None
+    """Folder of trials and observations, kept between runs (OUT.work)."""
+
+    def comparison(self) -> DetectOptions:
+        """Returns the options of `detect evaluate`."""
+        source = replace(self.side_by_side.source, workers=self.workers)
+        return DetectOptions(
+            comparison=replace(self.side_by_side, source=source),
+            scores=self.scores,
+            frame_strips=self.frame_strips,
+            work=self.work,
+            out=self.out,
+        )
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = EvalMonitorOptions
+
+
+def run(options: EvalMonitorOptions) -> int:
     """Runs the one of the two commands that the options belong to."""
     from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 
-    frames, side = ("monitor", "data"), detect_evaluate.NEEDED
-    if args.scores:
-        detect_evaluate.refuse_with_scores(args, (*frames, *side))
-        return detect_evaluate.report_scores(args)
-    wanted, others = (side, frames) if args.detector else (frames, side)
-    missing = [name for name in wanted if not getattr(args, name)]
-    clash = [name for name in others if getattr(args, name)]
+    frames = {"monitor": options.monitor, "data": options.data}
+    comparison = options.comparison()
+    if options.scores:
+        detect_evaluate.refuse_with_scores(frames | comparison.needed)
+        return detect_evaluate.report_scores(options.scores, options.out)
+    chosen = bool(options.side_by_side.detectors)
+    wanted, others = (comparison.needed, frames) if chosen else (frames, comparison.needed)
+    missing = [name for name, value in wanted.items() if not value]
+    clash = [name for name, value in others.items() if value]
     if missing or clash:
-        what = f"--{missing[0]} is missing" if missing else f"--{clash[0]} does not belong to --{wanted[0]}"
+        first = next(iter(wanted))
+        what = f"--{missing[0]} is missing" if missing else f"--{clash[0]} does not belong to --{first}"
         raise MonitorError(
             f"{what}. Give --monitor and --data to measure a monitor on frames; or --detector, --scenarios "
             "and --policy to compare detectors on a policy's trials"
         )
-    return detect_evaluate.compare(args) if args.detector else detect_evaluate_frames.run(args)
+    return detect_evaluate.compare(comparison) if chosen else detect_evaluate_frames.run(options)

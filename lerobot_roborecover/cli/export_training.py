@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.utils.options import option
 
 HELP = (
     "Make a dataset for lerobot-train from trials, forks and donors, each frame with success, intervention, "
@@ -14,38 +15,36 @@ HELP = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add = parser.add_argument
-    add(
-        "sources", nargs="+", type=Path,
-        help="trial logs of runs with --env.record_actions=true, logs of `detect fork`, folders of donors",
-    )  # fmt: skip
-    add("--scenarios", required=True, help="scenario set of the trials: folder, Hub id or shipped name")
-    add("--revision", help="commit, tag or branch of that set on the Hub")
-    add("--split", default="train", help="take this split of it only (%(default)s)")
-    add("--out", required=True, type=Path, help="folder of the dataset; new or empty")
-    add(
-        "--outcome",
-        default="all",
-        choices=("all", "successes", "failures"),
-        help="which trials (%(default)s)",
-    )
-    add("--num-workers", type=int, default=1, help="processes that replay and render (%(default)s)")
-    add(
-        "--statistics-of", metavar="CHECKPOINT",
-        help="normalise as this checkpoint does, whose training goes on here",
-    )  # fmt: skip
-    add("--license", type=license_argument, help="licence by the Hub's identifier; none is assumed")
-    add(
-        "--env", action="append", default=[], metavar="NAME=VALUE",
-        help="option of the recovery env type, e.g. obs_type=state; may be given again",
-    )  # fmt: skip
-    renamed(parser, "--outcome", "--of")
-    renamed(parser, "--num-workers", "--workers")
+@dataclass(frozen=True, kw_only=True)
+class TrainingDataOptions:
+    """Which trials become training data."""
+
+    sources: tuple[Path, ...] = option(positional=True)
+    """Trial logs of runs with --env.record_actions=true, logs of `detect fork`, folders of donors."""
+    scenarios: str
+    """Scenario set of the trials: folder, Hub id or shipped name."""
+    revision: str | None = None
+    """Commit, tag or branch of that set on the Hub."""
+    split: str = "train"
+    """Take this split of it only."""
+    out: Path
+    """Folder of the dataset; new or empty."""
+    outcome: Literal["all", "successes", "failures"] = option("all", old=("of",))
+    """Which trials."""
+    num_workers: int = option(1, old=("workers",))
+    """Processes that replay and render."""
+    statistics_of: str | None = option(None, metavar="CHECKPOINT")
+    """Normalise as this checkpoint does, whose training goes on here."""
+    license: str | None = option(None, parse=license_argument)
+    """Licence by the Hub's identifier; none is assumed."""
+    env: tuple[str, ...] = option((), metavar="NAME=VALUE")
+    """Option of the recovery env type, e.g. obs_type=state; may be given again."""
 
 
-def run(args: argparse.Namespace) -> int:
+OPTIONS = TrainingDataOptions
+
+
+def run(options: TrainingDataOptions) -> int:
     """Reads, replays, writes; says what was left out."""
     from collections import Counter
 
@@ -64,26 +63,26 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_roborecover.utils.atomic_io import check_new
     from lerobot_roborecover.utils.progress import Progress
 
-    check_new(args.out)
-    scenarios = load_scenarios(args.scenarios, revision=args.revision, split=args.split)
+    check_new(options.out)
+    scenarios = load_scenarios(options.scenarios, revision=options.revision, split=options.split)
     by_id = {s.id: s for s in scenarios}
     dropped: Counter = Counter()
     lines: list[TrainingLine] = []
-    for source in args.sources:
+    for source in options.sources:
         if source.is_dir():
             lines += lines_of_dataset(read_trajectories(source), by_id, dropped)
         else:
-            lines += lines_of_log(source, by_id, dropped, args.outcome)
+            lines += lines_of_log(source, by_id, dropped, options.outcome)
     lines = without_test(lines, dropped)
-    spec = env_config(scenarios.platform, args.scenarios, [f"--{o}" for o in args.env]).run_spec()
+    spec = env_config(scenarios.platform, options.scenarios, [f"--{o}" for o in options.env]).run_spec()
 
     def finish(folder: Path) -> None:
-        if args.statistics_of:
-            use_statistics_of(folder, Path(args.statistics_of))
+        if options.statistics_of:
+            use_statistics_of(folder, Path(options.statistics_of))
 
     made = export_training(
-        args.out, lines, simulator=spec.slot.options, workers=args.num_workers, dropped=dropped,
-        description=f"Trials by {', '.join(policies_of(lines))}, for training.", license=args.license,
+        options.out, lines, simulator=spec.slot.options, workers=options.num_workers, dropped=dropped,
+        description=f"Trials by {', '.join(policies_of(lines))}, for training.", license=options.license,
         on_episode=Progress("episode"), also=finish,
     )  # fmt: skip
     for reason, count in dropped.most_common():
@@ -91,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     print(
         f"{made.episodes} episodes ({made.successes} succeed), {made.frames} frames, {made.interventions} of "
         f"them by an intervention\n\nlerobot-train --dataset.repo_id=local/training "
-        f"--dataset.root={args.out} --policy.type=... --output_dir=...\n"
+        f"--dataset.root={options.out} --policy.type=... --output_dir=...\n"
         f"with RA-BC ({PROGRESS_FILE}): --sample_weighting.type=rabc"
         + ("" if made.progress_known else " --sample_weighting.head_mode=dense")
     )

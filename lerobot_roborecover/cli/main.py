@@ -61,8 +61,6 @@ def _add_command(commands: Any, command: Command) -> None:
 def _add_arguments(parser: Parser, module: ModuleType) -> None:
     if hasattr(module, "OPTIONS"):
         add_options(parser, module.OPTIONS)
-    elif hasattr(module, "add_arguments"):
-        module.add_arguments(parser)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -96,7 +94,7 @@ def _run(call: Call) -> int:
     if hasattr(module, "pass_through"):
         return module.pass_through(list(call.rest))
     args = command_parser(call).parse_args(call.rest)
-    return module.run(read_options(module.OPTIONS, args) if hasattr(module, "OPTIONS") else args)
+    return module.run(read_options(module.OPTIONS, args))
 
 
 class _ListParser(Parser):

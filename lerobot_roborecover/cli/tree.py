@@ -13,8 +13,8 @@ class Command:
     name: str
     """As it is typed after `roborecover`, e.g. `curate split`."""
     module: str
-    """In this folder, with `HELP`, `add_arguments(parser)` and `run(args) -> exit status`. Where another
-    parser reads the arguments: with `HELP` and `pass_through(argv) -> exit status`."""
+    """In this folder, with `HELP`, `OPTIONS` (the command's dataclass) and `run(options) -> exit status`.
+    Where another parser reads the arguments: with `HELP` and `pass_through(argv) -> exit status`."""
     summary: str
     """One line for the lists of commands."""
     old: str = ""

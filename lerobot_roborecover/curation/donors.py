@@ -28,6 +28,7 @@ from lerobot_roborecover.datasets.rendered_steps import RenderedSteps, RenderJob
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.utils.text import pluralize
 
 
@@ -35,18 +36,22 @@ from lerobot_roborecover.utils.text import pluralize
 class DonorOptions:
     """Thresholds; the defaults are the paper's."""
 
-    base_below: float = 0.4
-    """The base's recovery rate on a scenario must be below this."""
-    donor_above: float = 0.6
-    """An alternative's must be above this."""
+    base_below: float = option(0.4, name="max-base-rate", old=("base-below",))
+    """The base recovers a scenario less often."""
+    donor_above: float = option(0.6, name="min-donor-rate", old=("donor-above",))
+    """An alternative recovers it more often."""
     trials: int = 4
     """Of each candidate."""
     successes: int = 3
     """Of these, at least."""
     per_record: int = 1
-    """Different trajectories kept of one source record, at most."""
-    deterministic: tuple[str, ...] = ()
-    """Policies, as in the trial logs, that do the same in every trial: one counts as all."""
+    """Trajectories per source record.
+
+    Different ones that are kept, at most.
+    """
+    deterministic: tuple[str, ...] = option((), metavar="CHECKPOINT")
+    """This alternative (or its name in the logs) does the same in every trial: one of each candidate counts
+    as all."""
 
     def __post_init__(self):
         if not 0.0 <= self.base_below <= 1.0 or not 0.0 <= self.donor_above < 1.0:

@@ -13,6 +13,7 @@ from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.policies.identity import policy_identity
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.journal import InUseError, open_locked
+from lerobot_roborecover.utils.options import internal, option
 
 SCENARIOS = "metaworld_starter"
 TRIALS = 1
@@ -40,26 +41,34 @@ def shipped_policy() -> Path:
 class DemoSettings:
     """One demo run."""
 
-    out: Path
-    """Folder of everything the demo leaves behind."""
-    policy: str
-    """Folder or Hub id of the policy, as `lerobot-eval --policy.path` takes it."""
-    scenarios: str = SCENARIOS
-    """Scenario set: shipped name, folder or Hub id."""
+    out: Path = Path("outputs/demo")
+    """Folder of the results; rerun to go on."""
+    policy: str = option("", name="policy.path", metavar="POLICY", show_default=False)
+    """Folder or Hub id of another Meta-World policy.
+
+    Empty: the shipped one, whose folder stands here then.
+    """
+    scenarios: str = option(SCENARIOS, show_default=False)
+    """Another scenario set: shipped name, folder or Hub id."""
     select: str = ""
-    """Which of them, in the language of `--env.select`."""
+    """Which scenarios, e.g. 'cell=Approach-*; source=natural'."""
     limit: int | None = None
-    """At most this many of them, spread evenly over the set."""
-    trials: int = TRIALS
-    """Trials per scenario and start."""
+    """At most this many scenarios, spread over the set."""
+    trials: int = option(TRIALS, show_default=False)
+    """Trials per scenario and start (default: 1, the shipped policy is deterministic)."""
     obs_type: str = "state"
-    """Observations: `state` renders nothing; policies that see need `pixels` or `pixels_agent_pos`."""
+    """What that policy sees: state, pixels, pixels_agent_pos.
+
+    `state` renders nothing.
+    """
     pictures: bool = True
-    """Whether the page shows recovery frames."""
-    program: tuple[str, ...] = ()
+    """Write the page without recovery frames."""
+    program: tuple[str, ...] = internal(())
     """What to run as `lerobot-eval`; empty: the one of this Python."""
 
     def __post_init__(self):
+        if not self.policy:
+            object.__setattr__(self, "policy", str(shipped_policy()))
         if self.trials < 1:
             raise DemoError(f"--trials {self.trials}: at least 1 trial per scenario is needed")
         if self.limit is not None and self.limit < 1:

@@ -32,7 +32,8 @@ from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import ScenarioError
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.detection.request import DetectionRequest, NamedDetector
+    from lerobot_roborecover.detection.options import DetectionRequest
+    from lerobot_roborecover.detection.request import NamedDetector
 
 
 def check_held_out(named: NamedDetector, links: Sequence[ScenarioLink]) -> None:

@@ -23,9 +23,9 @@ from lerobot_roborecover.detection.learning import (
     fit_detectors,
     fork_logs,
 )
+from lerobot_roborecover.detection.options import DetectionRequest
 from lerobot_roborecover.detection.scoring import PolicySignals, cost_ms, score_trials
-from lerobot_roborecover.detection.trials import ReplayedTrial, TrialSource, replay_trials
-from lerobot_roborecover.errors import check_seed
+from lerobot_roborecover.detection.trials import ReplayedTrial, replay_trials
 from lerobot_roborecover.policies.detectors.base import DetectorRewardModel
 from lerobot_roborecover.policies.detectors.interface import Detector, MonitorDetector
 from lerobot_roborecover.policies.detectors.loading import (
@@ -45,38 +45,6 @@ TRUTHS = ("recovery_point", "outcome")
 """Both are known once trials are over."""
 DETECTORS_FOLDER = "detectors"
 """In the folder of the report: those that a composite policy can load."""
-
-
-@dataclass(frozen=True)
-class DetectionRequest:
-    """What is compared, and on what."""
-
-    detectors: Sequence[str]
-    """`[NAME=]WHAT[,option=value...]` each (`interventions.detectors.loading.load_detector`)."""
-    source: TrialSource
-    split: str = "test"
-    fit_split: str = "train"
-    """Scenarios whose trials detectors that learn are fitted to."""
-    fit_select: str | None = None
-    """Which of them; None takes those that `source.select` takes."""
-    training_data: Path | None = None
-    """LeRobotDataset that the policy was trained on, for the distance from training states."""
-    forks: Path | None = None
-    """Log of `roborecover detect fork` on the policy's trials, for the expected gain."""
-    alpha: float = 0.1
-    """False-alarm rate of the conformal thresholds, a clean rollout."""
-    on_training_scenarios: bool = False
-    device: str | None = None
-    base_model: str | None = None
-    """Of a Qwen3-VL monitor whose base has moved."""
-    level: float = 0.95
-    seed: int = 0
-    """Of the halves of the scenarios."""
-    against: Sequence[str] = ()
-    """Names of detectors; pairs without one of them are not tested. Empty: all pairs are."""
-
-    def __post_init__(self):
-        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import Outcome, Scenario
 from lerobot_roborecover.utils.atomic_io import atomic_file
+from lerobot_roborecover.utils.options import internal, option
 
 if TYPE_CHECKING:
     from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
@@ -37,22 +38,27 @@ _AT_ONCE = 256
 class TrialSource:
     """Which trials."""
 
-    scenarios: str
+    scenarios: str = option("", show_default=False)
     """Scenario set: folder, Hub id or shipped name."""
-    policy: str
-    """Checkpoint that acts."""
-    work: Path
+    policy: str = option("", metavar="CHECKPOINT", show_default=False)
+    """Policy that acts in the trials, and is watched."""
+    work: Path = internal(Path("outputs/detectors.work"))
     """Folder of trials and observations."""
-    revision: str | None = None
+    revision: str | None = option(None, name="scenarios-revision", metavar="REVISION")
+    """Commit, tag or branch of the set on the Hub."""
     select: str = ""
-    env: Sequence[str] = ()
-    """`NAME=VALUE` options of the recovery env type."""
+    """Which scenarios, e.g. 'suite=hard; source=natural'."""
+    env: Sequence[str] = option((), metavar="NAME=VALUE")
+    """Option of the recovery env type, e.g. obs_type=state; may be given again."""
     trials: int = 1
     """Of each scenario, from each start."""
     run_seed: int = 1000
+    """Of the trials."""
     device: str | None = None
-    workers: int = 1
-    slots: int = 0
+    """Where the policy and the detectors run."""
+    workers: int = option(1, name="num-workers", old=("workers",))
+    """Processes that replay and render."""
+    slots: int = internal(0)
 
     def env_options(self, split: str, start: str) -> list[str]:
         """Options of the env type for trials of a split from a start."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from lerobot_roborecover.curation.continuations import Continuation
 from lerobot_roborecover.datasets.trajectory_write import split_by_scenario
 from lerobot_roborecover.errors import check_seed
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.utils.options import option
 
 TRAIN, BALANCED, NATURAL = "train", "validation_balanced", "validation_natural"
 PARTS = (TRAIN, BALANCED, NATURAL)
@@ -26,22 +28,33 @@ class DataOptions:
     """How frames are chosen."""
 
     validation: float = 0.1
-    """Held-out scenarios: a share up to 1, or a number of them (paper: 80 of 800 on RoboTwin). 1 holds out
-    all and makes no training part, e.g. to measure on a test split."""
-    split_by: str = "scenario"
-    """`scenario`; or `cluster`, which keeps scenarios of one source trajectory together."""
-    train_balanced: bool = True
-    """As many frames of each label in `train` (paper, RoboTwin), or as they come (paper, LIBERO)."""
+    """Held-out share or number; 1: all.
+
+    Of scenarios (paper: 80 of 800 on RoboTwin). 1 makes no training part, e.g. to measure on a test split.
+    """
+    split_by: Literal["scenario", "cluster"] = "scenario"
+    """What is held out whole; a cluster is the scenarios of one source trajectory."""
+    train_balanced: bool = option(True, name="natural-training")
+    """Do not balance the labels of the training part.
+
+    Balanced in the paper on RoboTwin, natural on LIBERO.
+    """
     train_frames: int | None = None
-    """Frames of `train`; None takes all there are, or twice those of the rarer label."""
+    """Frames of the training part (all that balance allows)."""
     balanced_frames: int | None = None
-    """Frames of the balanced validation; None as above."""
+    """Frames of the balanced validation (all that balance allows)."""
     natural_frames: int | None = None
-    """Frames of the natural validation; None takes every one, which delays in steps are exact for."""
-    every: int = 1
-    """Only every n-th step, counted from the recovery point both ways, can be chosen."""
+    """Frames of the natural validation (every one).
+
+    Delays in steps are exact for every one.
+    """
+    every: int = option(1, name="stride", metavar="N", old=("every",))
+    """Choose among every N-th step only.
+
+    Counted from the recovery point both ways.
+    """
     seed: int = 0
-    """Of the split and of the choice of frames."""
+    """Of the split and the choice of frames."""
 
     def __post_init__(self):
         check_seed(self.seed)

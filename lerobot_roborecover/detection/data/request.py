@@ -10,6 +10,7 @@ from pathlib import Path
 from lerobot_roborecover.curation.continuations import Continuation, from_rollouts, from_trials
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, read_trials, run_trials
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
+from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.trajectories import read_trajectories
 from lerobot_roborecover.detection.data.choice import DataOptions, choose
 from lerobot_roborecover.detection.data.data import describe, write_monitor_data
@@ -17,6 +18,7 @@ from lerobot_roborecover.logs.policy_settings import digest_of
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.utils.options import option
 
 
 @dataclass(frozen=True)
@@ -26,26 +28,38 @@ class MonitorRequest:
     scenarios: str
     """Scenario set: folder, Hub id or shipped name."""
     out: Path
-    policies: Sequence[str] = ()
-    """Checkpoints that continue every scenario once."""
-    trials_from: Sequence[Path] = ()
-    """Folders of trials that a command left, e.g. screening: the first of a scenario is not run again."""
-    rollouts: Sequence[Path] = ()
-    """Trajectory datasets with recorded continuations."""
+    """Folder of the three datasets."""
+    policies: Sequence[str] = option((), name="policy", metavar="CHECKPOINT")
+    """Screening policy; give it again.
+
+    Each continues every scenario once.
+    """
+    trials_from: Sequence[Path] = option((), metavar="DIR")
+    """Folder of a policy's trials with their actions, e.g. SCREENED.trials/NAME: the first of each scenario
+    is not run again; may be given again."""
+    rollouts: Sequence[Path] = option((), metavar="DIR")
+    """Recorded continuations: a trajectory dataset whose episodes belong to the scenarios."""
     revision: str | None = None
+    """Commit, tag or branch of that set on the Hub."""
     split: str = "train"
+    """Take this split of it only."""
     select: str = ""
+    """Which scenarios, e.g. 'suite=libero_goal; source=natural'."""
     work: Path | None = None
-    """Folder of the policies' trials; default: beside `out`."""
-    env: Sequence[str] = ()
-    """`NAME=VALUE` options of the recovery env type."""
-    frames: Sequence[str] = ()
-    """The same for rendering alone."""
+    """Folder of the policies' trials, kept between runs (OUT.trials)."""
     choice: DataOptions = field(default_factory=DataOptions)
     run_seed: int = 1000
+    """Of the policies' trials."""
     device: str | None = None
-    workers: int = 1
-    license: str | None = None
+    """Of the policies."""
+    workers: int = option(1, name="num-workers", old=("workers",))
+    """Processes that replay and render."""
+    license: str | None = option(None, parse=license_argument)
+    """Licence by the Hub's identifier, of the frames; none is assumed."""
+    env: Sequence[str] = option((), metavar="NAME=VALUE")
+    """Option of the recovery env type, e.g. obs_type=state; may be given again."""
+    frames: Sequence[str] = option((), metavar="NAME=VALUE")
+    """The same for the rendered frames alone, where they differ from what the policies see."""
 
 
 @dataclass(frozen=True)

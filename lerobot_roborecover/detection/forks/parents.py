@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.fork_gain import FORK
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
+from lerobot_roborecover.utils.options import option
 
 OF = ("all", "failures", "successes")
 
@@ -28,18 +30,28 @@ class LoggedTrial:
     """(steps, A) as executed, in their own type."""
 
 
+def _steps(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(step) for step in text.split(",") if step.strip())
+    except ValueError:
+        raise OptionError(f"--steps={text}: steps, e.g. 0,40,80") from None
+
+
 @dataclass(frozen=True)
 class Choice:
     """Which trials, and which steps."""
 
-    of: str = "all"
-    """`all`, `failures` or `successes`. Only `all` says what an intervention gains on average."""
-    trials: int = 0
-    """Of each scenario, at most; 0 takes every one."""
-    every: int = 25
-    """Every so many steps from the handoff on."""
-    at: tuple[int, ...] = ()
-    """These steps instead."""
+    of: str = option("all", name="outcome", choices=OF, old=("of",))
+    """Which trials.
+
+    Only `all` says what an intervention gains on average.
+    """
+    trials: int = option(0, text="")
+    """Trials of each scenario, at most (all)."""
+    every: int = option(25, name="stride", old=("every",))
+    """Fork every so many steps, from the handoff on."""
+    at: tuple[int, ...] = option((), name="steps", metavar="STEPS", text="", parse=_steps, old=("at",))
+    """Fork at these steps instead, e.g. 0,40,80."""
 
     def __post_init__(self):
         if self.of not in OF:

@@ -28,6 +28,7 @@ from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyRunner
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import internal, json_object, option
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -44,31 +45,40 @@ _CHECKED = 10
 class ForkRequest:
     """What is asked for."""
 
-    logs: Sequence[Path]
-    policy: str
-    """Checkpoint of the logged trials."""
-    out: Path
-    arms: Sequence[ForkArm]
+    logs: Sequence[Path] = option(positional=True)
+    """Trial logs of runs with --env.record_actions=true."""
+    policy: str = option()
+    """Checkpoint that ran the trials: folder or Hub id."""
+    out: Path = option()
+    """Folder of the forks' log and page; a rerun goes on there."""
+    arms: Sequence[ForkArm] = internal(())
     """Beside `continue`, which is always there."""
     choice: Choice = field(default_factory=Choice)
     repeats: int = 1
-    """Random streams for each fork."""
+    """Random streams for each fork, shared by its arms."""
     scenarios: str = ""
-    """Set of the logged trials; empty takes the one that they name."""
+    """Scenario set of the trials (default: the one that they name)."""
     revision: str | None = None
-    env: Sequence[str] = ()
-    """`name=value` options of the env type, beside those that the rows say."""
-    policy_options: Sequence[str] = ()
-    """`name=value` options of the policy, as it was run."""
-    rename_map: Mapping[str, str] = field(default_factory=dict)
+    """Commit, tag or branch of that set on the Hub."""
+    env: Sequence[str] = option((), metavar="NAME=VALUE")
+    """Option of the recovery env type that the rows do not say; may be given again."""
+    policy_options: Sequence[str] = option((), name="policy-option", metavar="NAME=VALUE")
+    """Option of the policy as it was run, e.g. n_action_steps=10; may be given again."""
+    rename_map: Mapping[str, str] = option(
+        factory=dict, name="rename_map", parse=json_object("--rename_map", "observation keys")
+    )
+    """The env's observation keys to the policy's, JSON, as it was run."""
     correction_steps: int = 30
+    """Steps of a correction policy."""
     device: str | None = None
-    slots: int = 0
+    """Of the policies."""
+    slots: int = option(0, name="num-workers", old=("slots",))
+    """Simulators at once (as roborecover eval)."""
     max_batch: int = 1
-    """Observations per inference; more than one changes the last bits of a policy's actions."""
+    """Observations per inference; above 1 a policy's last bits depend on its company."""
     deterministic: bool = False
-    """Whether the policy does the same in every trial: going on is then the rest of the logged trial, which
-    is taken from the log."""
+    """The policy does the same in every trial: going on is the logged trial, which is not run again (one in
+    ten is, to check)."""
 
     def __post_init__(self):
         if not 1 <= self.repeats <= 10_000:

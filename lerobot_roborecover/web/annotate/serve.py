@@ -12,6 +12,7 @@ from lerobot_roborecover.curation.annotation.votes import VoteJournal, check_nam
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.web.annotate.identity import names_of
 from lerobot_roborecover.web.annotate.queue import queue_order
 from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
@@ -23,20 +24,23 @@ DEFAULT_PORT = 8731
 class AnnotateConfig:
     """One annotation session."""
 
-    dataset: Path
-    """A candidate dataset."""
-    annotators: Sequence[str]
-    """Who takes part here; others may take part from servers of their own."""
+    dataset: Path = option(positional=True)
+    """Folder of a candidate dataset."""
+    annotators: Sequence[str] = option((), name="annotator", metavar="NAME")
+    """Who annotates; repeat it for several at once, each with an address of their own.
+
+    Others may take part from servers of their own.
+    """
     port: int = DEFAULT_PORT
-    """0 takes a free one."""
-    votes: Path | None = None
-    """Folder of all votes; by default inside the dataset."""
+    """On this machine alone; 0 takes a free one."""
+    votes: Path | None = option(None, metavar="FOLDER")
+    """Of all votes (DATASET/meta/roborecover/votes)."""
     seed: int = 0
-    """Of the queues' order."""
-    only: Path | None = None
-    """A list of candidates to discuss (`roborecover curate agree --discuss`)."""
+    """Of the order in which each annotator sees the episodes."""
+    only: Path | None = option(None, metavar="LIST")
+    """A further round over what `roborecover curate agree --discuss` lists."""
     examples: bool = True
-    """Render the guide's example frames where the dataset holds none."""
+    """Render no example frames for the guide; those in the dataset are shown in any case."""
 
 
 def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.annotation.votes import check_name
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.options import internal, option
 from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 from lerobot_roborecover.web.teleop.hub import Hub
 from lerobot_roborecover.web.teleop.simulator_thread import SimulatorThread
@@ -25,27 +26,28 @@ DEFAULT_PORT = 8732
 class TeleopConfig:
     """One operator's session."""
 
-    dataset: Path
-    """The candidate dataset; new, or one that an earlier session made."""
-    platform: str
-    operator: str
-    """A plain name or pseudonym; becomes the recordings' controller."""
-    starts: Sequence[StartPoint] = ()
+    dataset: Path = option(positional=True)
+    """The candidate dataset: a new folder, or one that this command made."""
+    platform: str = "metaworld"
+    """Which can be driven by hand, e.g. libero."""
+    operator: str = option("", metavar="NAME", show_default=False)
+    """Your name or a pseudonym; the controller in the dataset."""
+    starts: Sequence[StartPoint] = internal(())
     port: int = DEFAULT_PORT
-    """0 takes a free one."""
-    rate_hz: float | None = None
-    """Control steps a second, at most; None for the simulator's own."""
+    """On this machine alone; 0 takes a free one."""
+    rate_hz: float | None = option(None, name="rate", metavar="HZ")
+    """Control steps a second, at most (the simulator's own rate)."""
     fps: float = 15.0
     """Live pictures a second, at most."""
-    view_size: int = 320
-    """Rows and columns of the live pictures."""
-    size: int | None = None
-    """Rows and columns of the dataset's pictures; None for the platform's own, 0 for none: numbers alone."""
-    frame_stride: int = 1
+    view_size: int = option(320, name="view", metavar="PIXELS")
+    """Size of the live pictures."""
+    size: int | None = option(None, metavar="PIXELS")
+    """Of the dataset's pictures; 0: none (the platform's own)."""
+    frame_stride: int = internal(1)
     """Steps from one of the dataset's pictures to the next, where rendering is slow."""
-    spacemouse: float | None = None
-    """What the end of a SpaceMouse's range gives, up to 1; None reads none."""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    spacemouse: float | None = option(None, nargs="?", const=0.5, metavar="SPEED")
+    """Drive with one that is plugged into this machine, too; SPEED is up to 1 (0.5)."""
+    options: Mapping[str, Any] = internal(factory=dict)
     """Of the simulator, beside its pictures."""
 
 
