@@ -39,7 +39,7 @@ from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.load_problems import load_remedy
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.metadata import policy_metadata
-from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner, WatchedHost
+from lerobot_roborecover.policies.runner import Act, PolicyError, PolicyRunner, WatchedHost, decision_of
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
@@ -230,13 +230,13 @@ def _check_trials(cfg: CheckPolicyConfig, host: PolicyRunner, scenario: Scenario
     answers = []
     for trial in range(2):
         history = host.start((cfg.seed or 0) + trial)
-        (chunk,) = host.act([observation], [scenario.task.instruction], [history])
+        (answer,) = host.act([observation], [scenario.task.instruction], [history])
         host.finish(history)
-        answers.append(chunk)
+        answers.append(answer if isinstance(answer, PolicyError) else decision_of(answer))
     first, second = answers
     if cfg.eval.n_episodes == 1 or isinstance(first, PolicyError):
         return ok("trials", str(cfg.eval.n_episodes))
-    if not isinstance(second, PolicyError) and np.array_equal(first, second):
+    if isinstance(first, Act) and isinstance(second, Act) and np.array_equal(first.actions, second.actions):
         fixed = getattr(cfg.policy, "inference_seed", None)
         remedy = (
             "--policy.inference_seed=null draws anew in every trial"

@@ -8,11 +8,18 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.evaluation.session import EvalSession
+from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.platforms.findings import Check, failure
 from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
-from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner
+from lerobot_roborecover.policies.runner import PolicyError, PolicyRunner, Rollback, decision_of
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, SlotFailure
+from lerobot_roborecover.workers.messages import (
+    ActResult,
+    EpisodeSpec,
+    EpisodeStart,
+    RollbackReply,
+    SlotFailure,
+)
 
 
 @dataclass
@@ -69,13 +76,25 @@ def take_steps(
     try:
         while len(actions) < steps:
             began = time.perf_counter()
-            (chunk,) = host.act([observations[-1]], [scenario.task.instruction], [history])
+            (answer,) = host.act([observations[-1]], [scenario.task.instruction], [history])
             infer_s.append(time.perf_counter() - began)
-            if isinstance(chunk, PolicyError):
+            if isinstance(answer, PolicyError):
                 return failure(
-                    "actions", str(chunk), "a chunk of actions",
+                    "actions", str(answer), "a chunk of actions",
                     "the policy cannot take what the env gives: see the inputs above, and the message",
                 )  # fmt: skip
+            decision = decision_of(answer)
+            if isinstance(decision, Rollback):
+                slot.send("rollback", resolve_rewind_steps(scenario, decision.steps))
+                reply = slot.receive()
+                if isinstance(reply, SlotFailure):
+                    return failure(
+                        "simulator", reply.message, "a rollback", "'roborecover doctor' checks simulators"
+                    )
+                assert isinstance(reply, RollbackReply)
+                observations[-1] = reply.observation
+                continue
+            chunk = decision.actions
             if problem := chunk_problem(scenario, chunk, width):
                 return _refused(problem, width)
             for action in chunk[: steps - len(actions)]:

@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from lerobot_roborecover.policies.runner import BY_RULE, Act, Controller, InterventionMark, Rollback
 from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.workers.control_columns import ControlColumns, Controller
 from lerobot_roborecover.workers.messages import RollbackReply
 
 _KINDS = {Controller.CORRECTION: "correction", Controller.HUMAN: "takeover"}
@@ -43,42 +43,42 @@ class InterventionRecord:
     _controller: Controller = Controller.BASE
     _solved: bool = False
 
-    def note(self, directive: ControlColumns, steps: int) -> None:
-        """Takes a directive in, before it is carried out."""
-        acts = bool(directive.rollback) or directive.controller is not self._controller
+    def note(self, decision: Act | Rollback, mark: InterventionMark, steps: int) -> None:
+        """Takes a decision and its mark in, before it is carried out."""
+        changes, back = mark.controller is not self._controller, isinstance(decision, Rollback)
         by = "schedule"
-        if directive.asked:
-            self._heard(directive)
-            if acts and self._monitor.step is None:
+        if mark.asked:
+            self._heard(mark)
+            if (back or changes) and self._monitor.step is None:
                 self._monitor.step, by = steps, "monitor"
-        if directive.rollback:
-            self._entries.append({"kind": "rollback", "step": steps, "by": by})
-        elif directive.controller is not self._controller and directive.controller in _KINDS:
-            kind = _KINDS[directive.controller]
+        if isinstance(decision, Rollback):
+            asked = BY_RULE if decision.steps is None else decision.steps
+            self._entries.append({"kind": "rollback", "step": steps, "by": by, "asked": asked})
+        elif changes and mark.controller in _KINDS:
+            kind = _KINDS[mark.controller]
             self._entries.append({"kind": kind, "step": steps, "by": by, "steps": 0})
-        self._controller = directive.controller
+        self._controller = mark.controller
 
-    def _heard(self, directive: ControlColumns) -> None:
+    def _heard(self, mark: InterventionMark) -> None:
         told = self._monitor
         told.calls += 1
-        told.seconds += directive.monitor_s
-        if math.isnan(directive.score):
+        told.seconds += mark.monitor_s
+        if math.isnan(mark.score):
             told.unparsable += 1
             return
         if told.step is None:
-            told.score = directive.score
-        told.highest = max(directive.score, directive.score if math.isnan(told.highest) else told.highest)
+            told.score = mark.score
+        told.highest = max(mark.score, mark.score if math.isnan(told.highest) else told.highest)
 
-    def acted(self, directive: ControlColumns) -> None:
-        """Counts an executed action for the controller that chose it."""
-        if directive.controller in _KINDS:
-            self._entries[-1]["steps"] += 1
+    def acted(self, controller: Controller, steps: int) -> None:
+        """Counts executed actions for the controller that chose them."""
+        if controller in _KINDS:
+            self._entries[-1]["steps"] += steps
 
-    def rolled_back(self, asked: int, result: RollbackReply) -> None:
+    def rolled_back(self, result: RollbackReply) -> None:
         """Fills in the rollback that was just noted."""
         self.undone += result.undone
         self._entries[-1] |= {
-            "asked": asked,
             "distance": result.distance,
             "undone": result.undone,
             "method": result.method,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import ray
@@ -17,7 +17,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.policies.runner import (
-    Chunk,
+    Decision,
     PolicyError,
     PolicyRunner,
     ReplicaHungError,
@@ -51,7 +51,7 @@ class PolicyActor:
 
     def act(
         self, observations: list, instructions: list[str], tokens: list[int]
-    ) -> tuple[list[Chunk | PolicyError], int]:
+    ) -> tuple[Sequence[Decision | PolicyError], int]:
         """`PolicyRunner.act`, and how many may be asked for from here."""
         histories = [self._histories[t] for t in tokens]
         return self._host.act(observations, instructions, histories), self._host.max_batch
@@ -99,7 +99,7 @@ class RayReplica(RestartableActor):
         self.ready = self._actor.act.remote(observations, instructions, histories)
         self.deadline = time.monotonic() + self._limit_s
 
-    def result(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError]:
+    def result(self, stop: Callable[[], bool] = lambda: False) -> Sequence[Decision | PolicyError]:
         """Its result.
 
         Args:

@@ -19,12 +19,13 @@ from lerobot_roborecover.evaluation.active_trial import ActiveTrial, WorkerState
 from lerobot_roborecover.evaluation.batching import BatchTimer
 from lerobot_roborecover.evaluation.first_trials import FirstTrials
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.trial import Act, Trial
+from lerobot_roborecover.evaluation.trial import Trial
 from lerobot_roborecover.evaluation.videos import VideoRecorder
 from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue, unfinished
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.action_checks import count_problem
 from lerobot_roborecover.policies.runner import (
+    Act,
     PolicyError,
     PolicyUnavailableError,
     Replica,
@@ -32,7 +33,6 @@ from lerobot_roborecover.policies.runner import (
     ReplicaLostError,
 )
 from lerobot_roborecover.scenario import Outcome, TrialStart
-from lerobot_roborecover.workers.control_columns import strip_columns
 from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackReply, SlotFailure
 from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
 
@@ -257,16 +257,15 @@ class Engine:
             answers = [PolicyError(problem)] * len(asked)
         seconds = self._clock() - began
         self._company[replica].inferred(len(asked), seconds)
-        for active, chunk in zip(asked, answers, strict=True):
+        for active, answer in zip(asked, answers, strict=True):
             trial, slot = active.trial, active.worker.slot
-            if isinstance(chunk, PolicyUnavailableError):
-                self._away(active, str(chunk))
+            if isinstance(answer, PolicyUnavailableError):
+                self._away(active, str(answer))
                 continue
-            if isinstance(chunk, PolicyError):
-                trial.on_policy_error(chunk, seconds=seconds)
+            if isinstance(answer, PolicyError):
+                trial.on_policy_error(answer, seconds=seconds)
             else:
-                actions, directives = strip_columns(chunk, self._run.action_width(active.unit.scenario))
-                move = trial.on_actions(actions, directives, seconds=seconds)
+                move = trial.on_actions(answer, seconds=seconds)
                 active.answered_at, active.answered_with = self._clock(), len(asked)
                 if isinstance(move, Act):
                     slot.send("act", move.actions)

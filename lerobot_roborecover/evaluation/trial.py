@@ -21,8 +21,6 @@ actions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 from typing import Protocol as Interface
 
@@ -40,10 +38,11 @@ from lerobot_roborecover.logs.row import (
     trial_key,
     trial_seed,
 )
+from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.policies.action_checks import action_problem, chunk_problem
+from lerobot_roborecover.policies.runner import Act, Decision, InterventionMark, Rollback, decision_of
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
-from lerobot_roborecover.workers.control_columns import ControlColumns
 from lerobot_roborecover.workers.messages import (
     ActResult,
     EpisodeSpec,
@@ -55,22 +54,6 @@ from lerobot_roborecover.workers.messages import (
 )
 
 SOLVED_THERE = "the task's predicate already holds where the rollback went"
-
-
-@dataclass(frozen=True)
-class Act:
-    """A decision to execute actions."""
-
-    actions: np.ndarray
-    """(n, A), checked."""
-
-
-@dataclass(frozen=True)
-class RollbackRequest:
-    """A decision to roll the simulation back instead of acting."""
-
-    steps: int
-    """How many; `control_columns.BY_RULE` for the platform's number."""
 
 
 class PolicyStateFactory(Interface):
@@ -125,7 +108,7 @@ class Trial:
         self._real_time = real_time
         self._clock: LatencyModel | None = None
         self._sent = np.empty((0, action_width))
-        self._directives: Sequence[ControlColumns] = ()
+        self._mark: InterventionMark | None = None
 
     @property
     def key(self) -> tuple:
@@ -176,35 +159,32 @@ class Trial:
         assert self.observation is not None
         return self.observation
 
-    def on_actions(
-        self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
-    ) -> Act | RollbackRequest | None:
+    def on_actions(self, decision: Decision, *, seconds: float) -> Act | Rollback | None:
         """Takes the policy's answer in.
 
         Args:
-            actions: (n, A), to be executed without looking in between. A bad one ends the trial when it comes
-                up, if it does.
-            directives: one per action, where the policy gives any.
+            decision: actions, or a rollback. A bad action ends the trial when it comes up, if it does.
             seconds: that the policy took, those of a shared batch in full.
 
         Returns:
-            What the simulator is to do; None where the trial is over instead.
+            What the simulator is to do: good actions, or a rollback by a number of steps. None where the
+            trial is over instead.
         """
         self._leave(TrialState.ASKED, to=TrialState.ACTING)
         self._policy_s += seconds
+        decision = decision_of(decision)
+        if isinstance(decision, Rollback):
+            return self._roll_back(decision)
+        actions, self._mark = decision.actions, decision.mark
         problem = chunk_problem(self.scenario, actions, self._action_width)
         if problem:
             self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {problem}")
             return None
         if self._clock is not None:
             actions = self._clock.sequence(actions, seconds)
-        self._sent, self._directives = actions, directives or ()
-        if self._directives:
-            first = self._directives[0]
-            self._record.note(first, self.steps)
-            if first.rollback:
-                self.state = TrialState.ROLLING_BACK
-                return RollbackRequest(first.rollback)
+        self._sent = actions
+        if self._mark is not None:
+            self._record.note(decision, self._mark, self.steps)
         good = 0
         while good < len(actions) and not self._problem(actions[good]):
             good += 1
@@ -241,7 +221,7 @@ class Trial:
                 self._end(reply.handoff.problem, reply.handoff.reason)
         elif isinstance(reply, RollbackReply):
             self._leave(TrialState.ROLLING_BACK, to=TrialState.WAITING)
-            self._record.rolled_back(self._directives[0].rollback, reply)
+            self._record.rolled_back(reply)
             self._sim_s += reply.seconds
             self.observation = reply.observation
             if reply.progress is not None:
@@ -334,12 +314,10 @@ class Trial:
     def _acted(self, reply: StepResult | ActResult) -> None:
         steps = reply.steps if isinstance(reply, ActResult) else 1
         self._sim_s += reply.seconds
-        for index, action in enumerate(self._sent[:steps]):
-            self._executed.append(np.array(action))
-            if self._directives:
-                if index:  # the first was noted when it was decided on
-                    self._record.note(self._directives[index], self.steps + index)
-                self._record.acted(self._directives[index])
+        sent = self._sent[:steps]
+        self._executed += [np.array(action) for action in sent]
+        if self._mark is not None:
+            self._record.acted(self._mark.controller, len(sent))
         self.steps += steps
         told = reply.progress if isinstance(reply, ActResult) else (reply.progress,)
         self._progress += [percent(done) for done in told if done is not None]
@@ -356,6 +334,16 @@ class Trial:
             self._end(outcome)
         elif steps < len(self._sent):
             self._end(Outcome.POLICY_ERROR, self._problem(self._sent[steps]))
+
+    def _roll_back(self, decision: Rollback) -> Rollback | None:
+        """The rollback by a number of steps, which is all that a simulator's worker takes."""
+        if decision.steps is not None and decision.steps < 1:
+            text = f"the policy asked for a rollback of {decision.steps} steps; it must be 1 or more"
+            self._end(Outcome.POLICY_ERROR, f"at step {self.steps}: {text}")
+            return None
+        self._record.note(decision, decision.mark, self.steps)
+        self.state = TrialState.ROLLING_BACK
+        return Rollback(resolve_rewind_steps(self.scenario, decision.steps), decision.mark)
 
     def _problem(self, action: np.ndarray) -> str:
         return action_problem(self.scenario, action, self._action_width)

@@ -28,15 +28,16 @@ from gymnasium.vector.utils import batch_space
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.session import EvalSession, SimulatorSpec, create_session, scenario_group
-from lerobot_roborecover.evaluation.trial import Act, Trial
+from lerobot_roborecover.evaluation.trial import Trial
 from lerobot_roborecover.evaluation.trial_state import TrialState
 from lerobot_roborecover.logs.row import EvalProtocol, trial_seed
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.action_checks import count_problem
+from lerobot_roborecover.policies.interventions.control_columns import strip_columns
 from lerobot_roborecover.policies.metadata import PolicyMetadata
+from lerobot_roborecover.policies.runner import Act
 from lerobot_roborecover.policies.watchdog import PolicyWatch
 from lerobot_roborecover.scenario import Scenario
-from lerobot_roborecover.workers.control_columns import strip_columns
 
 _FALLBACK_FRAME = (64, 64, 3)
 
@@ -132,8 +133,8 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         waited = time.perf_counter() - self._replied
         slots = self.run.pool.slots(self.num_envs)
         before = np.array([t.over for t in self._trials])
-        actions, directives = strip_columns(np.asarray(actions), self.run.action_width(self.scenario))
-        miscounted = count_problem(len(actions) if actions.ndim else 0, self.num_envs)
+        decisions = strip_columns(np.asarray(actions), self.run.action_width(self.scenario))
+        miscounted = count_problem(len(decisions), self.num_envs)
         working = []
         for index, trial in enumerate(self._trials):
             if trial.over:
@@ -142,8 +143,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
                 trial.on_policy_error(miscounted, seconds=waited)
                 self._record_if_over(trial)
                 continue
-            own = directives and directives[index : index + 1]
-            move = trial.on_actions(actions[index : index + 1], own, seconds=waited)
+            move = trial.on_actions(decisions[index], seconds=waited)
             if move is None:
                 self._record_if_over(trial)
                 continue

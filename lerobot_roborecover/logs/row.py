@@ -11,7 +11,7 @@ from typing import Any
 from unicodedata import normalize
 
 from lerobot_roborecover.logs.fields import MAX_TEXT, TRIAL_SCHEMA
-from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, TrialStart
 
@@ -44,9 +44,7 @@ class EvalProtocol:
 
     def rewind_for(self, scenario: TrialStart) -> int:
         """Steps before the recovery point on this scenario, before the task's start limits them."""
-        if self.rewind_steps is None:
-            return platform_named(scenario.platform).rewind_steps(scenario.task.horizon)
-        return self.rewind_steps
+        return resolve_rewind_steps(scenario, self.rewind_steps)
 
     def config_hash(self) -> str:
         """Short hash of everything above."""

@@ -13,12 +13,24 @@ from typing import Any
 from lerobot_roborecover.platforms.base import Platform, SimulatorSetup
 from lerobot_roborecover.platforms.registry import BUILT_IN, ENTRY_POINTS, ROBOT, platform_names, registered
 from lerobot_roborecover.platforms.simulator import Observation, Simulator, SimulatorError
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import ScenarioError, TrialStart
 
 _FAMILY = "lerobot_"
 """Of names of the one family: `lerobot_<env type>`."""
 
 _LOG = logging.getLogger(__name__)
+
+
+def resolve_rewind_steps(scenario: TrialStart, steps: int | None) -> int:
+    """Returns how many steps a rollback on a scenario goes back, before the task's start limits them.
+
+    Args:
+        scenario: whose platform and horizon decide the paper's number.
+        steps: a number; None takes the paper's.
+    """
+    if steps is not None:
+        return steps
+    return platform_named(scenario.platform).rewind_steps(scenario.task.horizon)
 
 
 def platform_named(name: str) -> Platform:

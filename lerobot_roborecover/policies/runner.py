@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -31,8 +33,61 @@ class ReplicaHungError(ReplicaLostError):
     and the histories of its other trials are lost."""
 
 
+BY_RULE = -1
+"""A rollback's number of steps, written for `None`: the paper's number for the task."""
+
+
+class Controller(IntEnum):
+    """Who chose an action."""
+
+    BASE = 0
+    CORRECTION = 1
+    HUMAN = 2
+
+
+@dataclass(frozen=True)
+class InterventionMark:
+    """What a policy that intervenes says beside a decision, for the trial's row."""
+
+    controller: Controller = Controller.BASE
+    asked: bool = False
+    """Whether the monitor was asked about the observation that the decision answers."""
+    score: float = float("nan")
+    """The monitor's; NaN where it was not asked or its answer could not be read."""
+    monitor_s: float = 0.0
+    """Seconds that the monitor took, shared by the batch."""
+
+
+@dataclass(frozen=True)
+class Act:
+    """A decision to execute actions without looking in between."""
+
+    actions: np.ndarray
+    """(n, A)."""
+    mark: InterventionMark | None = None
+    """Of the first action; its controller chose them all. None where the policy does not intervene."""
+
+
+@dataclass(frozen=True)
+class Rollback:
+    """A decision to put the simulation some steps back instead of acting."""
+
+    steps: int | None
+    """How many, at least 1; None takes the paper's number for the task."""
+    mark: InterventionMark = field(default_factory=InterventionMark)
+
+
 type Chunk = np.ndarray
-"""(n, A) actions to be executed without looking in between."""
+"""(n, A) actions: an `Act` without a mark."""
+type Decision = Chunk | Act | Rollback
+"""A policy's answer about a trial."""
+
+
+def decision_of(answer: Chunk | Act | Rollback) -> Act | Rollback:
+    """Returns a policy's answer as a decision; what is no decision is the actions of one, unchecked."""
+    return answer if isinstance(answer, Act | Rollback) else Act(answer)
+
+
 type Processor = Callable[[dict[str, Any]], dict[str, Any]]
 """An env type's, of observations or of actions: a batch by LeRobot's keys to another."""
 
@@ -66,9 +121,9 @@ class PolicyRunner(ReplicaHost, Protocol):
         observations: Sequence[Mapping[str, Any]],
         instructions: Sequence[str],
         histories: Sequence[Any],
-    ) -> list[Chunk | PolicyError]:
-        """One chunk of actions per waiting slot; an error in its place where the policy raised for it, or
-        cannot be reached (`PolicyUnavailableError`)."""
+    ) -> Sequence[Decision | PolicyError]:
+        """One decision per waiting slot; an error in its place where the policy raised for it, or cannot be
+        reached (`PolicyUnavailableError`)."""
 
 
 @runtime_checkable
@@ -121,7 +176,7 @@ class Replica(Protocol):
     def submit(self, observations: list, instructions: list[str], histories: list) -> None:
         """Begins an inference."""
 
-    def result(self, stop: Callable[[], bool]) -> list[Chunk | PolicyError] | None:
+    def result(self, stop: Callable[[], bool]) -> Sequence[Decision | PolicyError] | None:
         """Its result.
 
         Args:
@@ -161,7 +216,7 @@ class InlineReplica:
     def submit(self, observations: list, instructions: list[str], histories: list) -> None:
         self._asked = (observations, instructions, histories)
 
-    def result(self, stop: Callable[[], bool] = lambda: False) -> list[Chunk | PolicyError] | None:
+    def result(self, stop: Callable[[], bool] = lambda: False) -> Sequence[Decision | PolicyError] | None:
         """Infers.
 
         Args:
@@ -214,7 +269,7 @@ class WatchedHost:
         observations: Sequence[Mapping[str, Any]],
         instructions: Sequence[str],
         histories: Sequence[Any],
-    ) -> list[Chunk | PolicyError]:
+    ) -> Sequence[Decision | PolicyError]:
         """One answer per observation; an error for each where an inference has hung, now or before."""
         if not self._replica.gone:
             self._replica.submit(list(observations), list(instructions), list(histories))

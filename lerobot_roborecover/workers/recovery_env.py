@@ -13,14 +13,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator, platform_named
+from lerobot_roborecover.platforms import (
+    Simulator,
+    SimulatorError,
+    make_simulator,
+    platform_named,
+    resolve_rewind_steps,
+)
 from lerobot_roborecover.platforms.simulator import ShowsProgress
 from lerobot_roborecover.platforms.stepping import advance
 from lerobot_roborecover.replay.handoff import Handoff, hand_off
 from lerobot_roborecover.replay.rollback import RollbackHistory
 from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Start, TrialStart
-from lerobot_roborecover.workers.control_columns import BY_RULE
 from lerobot_roborecover.workers.messages import RollbackReply
 
 
@@ -72,9 +77,7 @@ class RecoveryEnv(gym.Env):
         self._platform.check_scenario(scenario)
         self.render_mode = render_mode
         self._start = Start(start)
-        if rewind_steps is None:
-            rewind_steps = self._platform.rewind_steps(scenario.task.horizon)
-        self._rewind_steps = rewind_steps
+        self._rewind_steps = resolve_rewind_steps(scenario, rewind_steps)
         self._check = handoff_check
         self._owns_simulator = simulator is None
         self._simulator = simulator or make_simulator(scenario.platform, **options)
@@ -156,16 +159,14 @@ class RecoveryEnv(gym.Env):
         """Puts the simulation back to the exact state that it had some steps ago.
 
         Args:
-            steps: how many, the prefix included; limited to what there is since the task's start. `BY_RULE`
-                takes the paper's number for the task.
+            steps: how many, the prefix included; limited to what there is since the task's start.
 
         Raises:
             SimulatorError: the state could not be had again.
         """
         trail = self._running()
         began = time.perf_counter()
-        task = self.scenario.task
-        rewound = trail.back(self._platform.rewind_steps(task.horizon) if steps == BY_RULE else steps)
+        rewound = trail.back(steps)
         self._undone += rewound.undone
         solved = self._simulator.succeeded()
         observation = self._simulator.observe()

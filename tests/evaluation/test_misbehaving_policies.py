@@ -16,10 +16,10 @@ from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
+from lerobot_roborecover.policies.interventions.control_columns import SIGNATURE
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.policies.policy_thread import CallTimeoutError, PolicyThread
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.workers.control_columns import SIGNATURE
 from lerobot_roborecover.workers.messages import SlotConfig
 from tests.evaluation.test_local_engine import PushHost
 from tests.support.factories import fake_dataset

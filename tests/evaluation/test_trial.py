@@ -9,12 +9,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Act, RollbackRequest, Trial
+from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Trial
 from lerobot_roborecover.evaluation.trial_state import TrialState
 from lerobot_roborecover.logs.row import EvalProtocol
+from lerobot_roborecover.policies.runner import Act, Controller, InterventionMark, Rollback
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.workers.control_columns import ControlColumns, Controller
 from lerobot_roborecover.workers.messages import (
     ActResult,
     EpisodeStart,
@@ -152,7 +152,7 @@ def test_going_back():
     trial = acting()
     trial.on_reply(StepResult({"state": 1}, False, 0.0))
     trial.ask()
-    assert trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0) == RollbackRequest(4)
+    assert trial.on_actions(Rollback(4), seconds=0.0) == Rollback(4)
     assert trial.state is TrialState.ROLLING_BACK
     trial.on_reply(RollbackReply({"state": -3}, 4, 1, "snapshot", 0.5, False))
     assert trial.state is TrialState.WAITING
@@ -164,9 +164,18 @@ def test_going_back():
     assert (told["step"], told["distance"], told["undone"], trial.steps) == (1, 4, 1, 2)
 
 
+def test_a_rollback_reaches_the_worker_as_a_number_of_steps():
+    assert asked().on_actions(Rollback(None), seconds=0.0) == Rollback(30), "the paper's, for this platform"
+    for steps in (0, -1):
+        trial = asked()
+        assert trial.on_actions(Rollback(steps), seconds=0.0) is None
+        assert trial.outcome is Outcome.POLICY_ERROR
+        assert f"rollback of {steps} steps" in trial.reason
+
+
 def test_going_back_to_where_the_task_is_solved():
     trial = asked()
-    trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=4)], seconds=0.0)
+    trial.on_actions(Rollback(4), seconds=0.0)
     trial.on_reply(RollbackReply({}, 4, 0, "snapshot", 0.5, True))
     assert (trial.outcome, trial.reason) == (Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
 
@@ -186,7 +195,7 @@ STATES = {
     TrialState.ASKED: asked,
     TrialState.ACTING: acting,
     TrialState.ROLLING_BACK: lambda: (
-        t := asked(), t.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=1)], seconds=0)
+        t := asked(), t.on_actions(Rollback(1), seconds=0)
     )[0],
     TrialState.OVER: lambda: (t := new(), t.skip())[0],
 }  # fmt: skip
@@ -260,23 +269,20 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
             break
         if kind == "back":
             trial.ask()
-            trial.on_actions(np.zeros((1, 2)), [ControlColumns(rollback=what)], seconds=0.0)
+            trial.on_actions(Rollback(what), seconds=0.0)
             back = min(what, simulated - undone)
             undone += back
             trial.on_reply(RollbackReply({}, what, back, "replay", 0.1, False))
             continue
         codes = {"plain": np.zeros(2), "solves": np.ones(2), "bad": BAD}
         chunk = np.stack([codes[code] for code in what])
-        said = [
-            ControlColumns(controller=controller, asked=True, score=0.5),
-            *[ControlColumns(controller=controller)] * 9,
-        ]
+        asked, silent = InterventionMark(controller, asked=True, score=0.5), InterventionMark(controller)
         for first in [0] if whole_chunks else range(len(chunk)):
             if trial.over:
                 break
             trial.ask()
             part = chunk if whole_chunks else chunk[first : first + 1]
-            move = trial.on_actions(part, said[first : first + len(part)], seconds=0.1)
+            move = trial.on_actions(Act(part, silent if first else asked), seconds=0.1)
             if move is None:
                 break
             steps, solved = 0, False

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.policies.runner import PolicyError
-from lerobot_roborecover.workers.control_columns import BY_RULE, Controller, strip_columns
+from lerobot_roborecover.policies.interventions.control_columns import append_columns, strip_columns
+from lerobot_roborecover.policies.runner import Act, Controller, PolicyError, Rollback
 from tests.support.small_interventions import CountingMember, ScriptedController, observation
 
 pytestmark = pytest.mark.lerobot
@@ -23,8 +23,18 @@ def director(mode, *, monitor=None, takeover=None, correction_steps=5):
     )
 
 
+def turns(decision):
+    """A decision as LeRobot's loop carries it: one per turn, read from the columns of a row."""
+    return strip_columns(append_columns(decision, 3), 3)
+
+
+def said(rows, at):
+    """Value `at` of each turn's action; 0 for a rollback, as in the row of zeros that carries it."""
+    return [0.0 if isinstance(r, Rollback) else r.actions[0, at] for r in rows]
+
+
 def run_alone(made, values, bad=()):
-    """Rows of one slot that sees these values, one a step; whole chunks are executed blindly."""
+    """Turns of one slot that sees these values, one a step; whole chunks are executed blindly."""
     episode = made.start(7)
     rows = []
     while len(rows) < len(values):
@@ -32,7 +42,7 @@ def run_alone(made, values, bad=()):
         (chunk,) = made.act([observation(values[step], step in bad)], ["go"], [episode])
         if isinstance(chunk, PolicyError):
             return rows, chunk
-        rows += list(chunk)
+        rows += turns(chunk)
     made.finish(episode)
     return rows[: len(values)], None
 
@@ -58,11 +68,10 @@ class At:
 def test_correction_acts_for_its_steps_and_both_sides_begin_afresh():
     made = director("correction")
     rows, _ = run_alone(made, [0.0] * 10)
-    who_and_step = [(r[0], r[1]) for r in rows]
+    who_and_step = list(zip(said(rows, 0), said(rows, 1), strict=True))
     assert who_and_step == [(2, 0), (2, 1), (2, 2), (2, 3), (2, 4), (1, 0), (1, 1), (1, 2), (1, 3), (1, 4)]
-    _, directives = strip_columns(np.stack(rows), 3)
-    assert [d.controller for d in directives] == [Controller.CORRECTION] * 5 + [Controller.BASE] * 5
-    assert not any(d.asked for d in directives)
+    assert [r.mark.controller for r in rows] == [Controller.CORRECTION] * 5 + [Controller.BASE] * 5
+    assert not any(r.mark.asked for r in rows)
     for member in made.members.values():
         assert member.begun == member.finished
 
@@ -73,22 +82,22 @@ def test_the_monitor_is_asked_every_step_until_it_triggers_once():
     values = [1, 8, 2, 9, 9, 9, 9, 9, 9, 9]
     rows, _ = run_alone(made, values)
     assert monitor.asked == [1, 8, 2, 9]
-    _, directives = strip_columns(np.stack(rows), 3)
-    assert [d.asked for d in directives] == [True] * 4 + [False] * 6
-    assert [r[0] for r in rows] == [1, 1, 1, 2, 2, 2, 2, 2, 1, 1]
+    assert [r.mark.asked for r in rows] == [True] * 4 + [False] * 6
+    assert said(rows, 0) == [1, 1, 1, 2, 2, 2, 2, 2, 1, 1]
     # The base's chunk of four is cut after three; when it is back, it begins anew.
-    assert [r[1] for r in rows] == [0, 1, 2, 0, 1, 2, 3, 4, 0, 1]
-    assert directives[3].score == pytest.approx(0.9)
-    assert np.isnan(directives[1].score)
+    assert said(rows, 1) == [0, 1, 2, 0, 1, 2, 3, 4, 0, 1]
+    assert rows[3].mark.score == pytest.approx(0.9)
+    assert np.isnan(rows[1].mark.score)
 
 
 def test_a_monitored_rollback_takes_a_turn_and_flushes_the_queue():
     made = director("monitor_reversion", monitor=At())
     rows, _ = run_alone(made, [1, 2, 9, 3, 3, 3])
-    _, directives = strip_columns(np.stack(rows), 3)
-    assert [d.rollback for d in directives] == [0, 0, BY_RULE, 0, 0, 0]
-    assert [r[1] for r in rows] == [0, 1, 0, 0, 1, 2]
-    assert (rows[2][:3] == 0).all()
+    assert [type(r) for r in rows] == [Act, Act, Rollback, Act, Act, Act]
+    assert rows[2].steps is None, "the paper's number"
+    assert rows[2].mark.asked
+    assert said(rows, 1) == [0, 1, 0, 0, 1, 2]
+    assert (append_columns(rows[2], 3)[0, :3] == 0).all()
 
 
 def test_a_person_takes_over_and_hands_back():
@@ -98,11 +107,11 @@ def test_a_person_takes_over_and_hands_back():
     )
     made = director("human", monitor=At(), takeover=takeover)
     rows, _ = run_alone(made, [1, 9, 0, 0, 0, 0, 0])
-    assert [r[0] for r in rows] == [1, 5, 5, 5, 1, 1, 1]
+    assert said(rows, 0) == [1, 5, 5, 5, 1, 1, 1]
     assert [s["over"] for s in takeover.taken] == [True]
     made = director("human", takeover=takeover)  # without a monitor: from the recovery point
     rows, _ = run_alone(made, [0, 0])
-    assert [r[0] for r in rows] == [5, 5]
+    assert said(rows, 0) == [5, 5]
     assert takeover.taken[-1]["over"], "a trial that ends while a person drives lets go of the slot"
 
 
@@ -113,7 +122,7 @@ def test_a_person_takes_over_and_hands_back():
 )
 def test_what_a_slot_does_depends_on_itself_alone(lives, mode):
     made = director(mode, monitor=At() if mode.startswith("monitor") else None)
-    alone = [np.stack(run_alone(made, life)[0])[:, :-1] for life in lives]  # without the clock's column
+    alone = [columns(run_alone(made, life)[0]) for life in lives]
     episodes = [made.start(7) for _ in lives]
     together = [[] for _ in lives]
     while any(len(rows) < 12 for rows in together):
@@ -124,15 +133,20 @@ def test_what_a_slot_does_depends_on_itself_alone(lives, mode):
             [episodes[i] for i in due],
         )
         for i, chunk in zip(due, chunks, strict=True):
-            together[i] += list(chunk)
+            together[i] += turns(chunk)
     for expected, rows in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(np.stack(rows)[:12, :-1], expected)
+        np.testing.assert_array_equal(columns(rows[:12]), expected)
+
+
+def columns(rows):
+    """(n, A + 4): turns with their columns, without the clock's."""
+    return np.concatenate([append_columns(r, 3) for r in rows])[:, :-1]
 
 
 def test_a_member_that_raises_costs_its_slot_alone():
     made = director("direct")
     episodes = [made.start(1), made.start(2)]
     good, bad = made.act([observation(0.0), observation(0.0, bad=True)], ["go"] * 2, episodes)
-    assert good.shape == (4, 8)
+    assert good.actions.shape == (4, 3)
     assert isinstance(bad, PolicyError)
     assert "base" in str(bad)

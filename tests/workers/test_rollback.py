@@ -14,15 +14,14 @@ from hypothesis import strategies as st
 from lerobot_roborecover.evaluation.intervention_record import InterventionRecord
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.scenario import Outcome
-from lerobot_roborecover.workers.control_columns import (
-    BY_RULE,
+from lerobot_roborecover.policies.interventions.control_columns import (
+    SIGNATURE,
     WIDTH,
-    ControlColumns,
-    Controller,
     append_columns,
     strip_columns,
 )
+from lerobot_roborecover.policies.runner import Act, Controller, InterventionMark, Rollback
+from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.workers.recovery_env import RecoveryEnv
 from tests.support.factories import fake_dataset, fake_scenario
 from tests.support.loop import evaluate, outcomes, push_policy
@@ -159,20 +158,23 @@ def check_real(env: RecoveryEnv, taken: int, backs: tuple[int, ...]) -> None:
             assert data_equivalence(observation, result.observation, exact=True)
 
 
-def test_directives_survive_float32_and_nothing_else_is_read_as_one():
-    told = ControlColumns(BY_RULE, Controller.CORRECTION, True, 0.75, 0.5)
-    rows = append_columns(np.zeros((3, 4), np.float32), told)
-    actions, directives = strip_columns(rows, 4)
-    assert actions.shape == (3, 4)
-    assert directives[0] == told
-    assert [d.asked for d in directives] == [True, False, False]
-    assert {d.controller for d in directives} == {Controller.CORRECTION}
-    unread = strip_columns(append_columns(np.zeros((1, 2)), ControlColumns(asked=True)), 2)[1][0]
-    assert unread.asked
-    assert np.isnan(unread.score)
-    wide = np.zeros((2, 4 + WIDTH), np.float32)
-    assert strip_columns(wide, 4)[1] is None
-    assert strip_columns(rows[:, :4], 4)[1] is None
+def test_decisions_survive_float32_and_nothing_else_is_read_as_one():
+    mark = InterventionMark(Controller.CORRECTION, True, 0.75, 0.5)
+    for steps in (None, 1, 60):
+        assert strip_columns(append_columns(Rollback(steps, mark), 4), 4) == [Rollback(steps, mark)]
+    rows = append_columns(Act(np.ones((3, 4), np.float32), mark), 4)
+    decisions = strip_columns(rows, 4)
+    assert [d.actions.tolist() for d in decisions] == [[[1.0] * 4]] * 3
+    assert decisions[0].mark == mark
+    assert [d.mark.asked for d in decisions] == [True, False, False]
+    assert {d.mark.controller for d in decisions} == {Controller.CORRECTION}
+    (unread,) = strip_columns(append_columns(Act(np.zeros((1, 2)), InterventionMark(asked=True)), 2), 2)
+    assert unread.mark.asked
+    assert np.isnan(unread.mark.score)
+    below = np.array([[0.0, 0.0, SIGNATURE, -2, 0, -1, 0]], np.float32)
+    for plain, width in ((np.zeros((2, 4 + WIDTH), np.float32), 4), (rows[:, :4], 4), (below, 2)):
+        assert [d.mark for d in strip_columns(plain, width)] == [None] * len(plain)
+        assert np.array_equal(np.concatenate([d.actions for d in strip_columns(plain, width)]), plain)
 
 
 class Rewinds:
@@ -185,11 +187,13 @@ class Rewinds:
         actions = push_policy(observation)
         go_back = self._turn == self._at
         self._turn += 1
-        return attach_all(actions, ControlColumns(self._steps if go_back else 0))
+        return attach_all(actions, self._steps if go_back else 0)
 
 
-def attach_all(actions: np.ndarray, directive: ControlColumns) -> np.ndarray:
-    return np.concatenate([append_columns(a[None], directive) for a in actions])
+def attach_all(actions: np.ndarray, rollback: int = 0) -> np.ndarray:
+    """Rows of LeRobot's loop, one a slot: actions, or rollbacks by this many steps."""
+    decisions = [Rollback(rollback) if rollback else Act(a[None], InterventionMark()) for a in actions]
+    return np.concatenate([append_columns(d, actions.shape[1]) for d in decisions])
 
 
 def rolling_rows(dataset, log, at: int, steps: int, batch: int = 1):
@@ -260,8 +264,8 @@ def test_success_in_the_extra_steps_counts_under_one_reading_alone(solved_at, ex
     from lerobot_roborecover.workers.messages import RollbackReply
 
     record = InterventionRecord()
-    record.note(ControlColumns(15), 20)
-    record.rolled_back(15, RollbackReply({}, 15, 15, "snapshot", 0.0, False))
+    record.note(Rollback(15), InterventionMark(), 20)
+    record.rolled_back(RollbackReply({}, 15, 15, "snapshot", 0.0, False))
     assert record.budget(45) == 60
     record.solved()
     outcome, steps = record.verdict(solved_at, 45)
@@ -278,9 +282,9 @@ def test_a_rollback_in_one_slot_leaves_the_others_alone(singles, tmp_path):
     turn = iter(range(10_000))
 
     def one_of_three(observation):
-        rows = attach_all(push_policy(observation), ControlColumns())
+        rows = attach_all(push_policy(observation))
         if next(turn) == 9:
-            rows[1] = append_columns(rows[1:2, :2], ControlColumns(5))[0]
+            rows[1] = append_columns(Rollback(5), 2)[0]
         return rows
 
     mixed = evaluate(
@@ -303,7 +307,7 @@ def test_an_interrupted_run_with_rollbacks_resumes(tmp_path):
         def __call__(self, observation):
             begins = tuple(observation["environment_state"][0]) in starts
             self.turns = 0 if begins else self.turns + 1
-            return attach_all(push_policy(observation), ControlColumns(3 if self.turns == 5 else 0))
+            return attach_all(push_policy(observation), 3 if self.turns == 5 else 0)
 
     starts = {tuple(RecoveryEnv(fake_scenario(i)).reset()[0]["environment_state"]) for i in range(3)}
     whole = evaluate(

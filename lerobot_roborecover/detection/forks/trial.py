@@ -21,12 +21,18 @@ from lerobot_roborecover.analysis.stats.fork_gain import FORK, MATCHED, ForkNote
 from lerobot_roborecover.detection.forks.arms import ForkArm
 from lerobot_roborecover.detection.forks.parents import LoggedTrial
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.trial import Act, PolicyStateFactory, RollbackRequest, Trial
+from lerobot_roborecover.evaluation.trial import PolicyStateFactory, Trial
 from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow, trial_seed
-from lerobot_roborecover.policies.runner import Chunk, PolicyError, PolicyRunner
+from lerobot_roborecover.policies.runner import (
+    Act,
+    Decision,
+    PolicyError,
+    PolicyRunner,
+    Rollback,
+    decision_of,
+)
 from lerobot_roborecover.scenario import Start, TrialStart
-from lerobot_roborecover.workers.control_columns import ControlColumns
 from lerobot_roborecover.workers.messages import EpisodeSpec
 
 SAME_ACTION = 1e-4
@@ -120,12 +126,12 @@ class ForkTrial(Trial):
         )
         return host.lead(self.seed, self._fork.step, stream)
 
-    def on_actions(
-        self, actions: np.ndarray, directives: Sequence[ControlColumns] | None = None, *, seconds: float
-    ) -> Act | RollbackRequest | None:
+    def on_actions(self, decision: Decision, *, seconds: float) -> Act | Rollback | None:
         """As `Trial.on_actions`. Before the fork the logged actions replace the policy's equal ones."""
         fork = self._fork
-        if fork.arm.teacher_forced and self.steps < fork.step:
+        decision = decision_of(decision)
+        if fork.arm.teacher_forced and self.steps < fork.step and isinstance(decision, Act):
+            actions = decision.actions
             logged = fork.parent.actions[self.steps : self.steps + len(actions)]
             own = actions[: len(logged)]
             # `not`: also where one is no number
@@ -134,8 +140,8 @@ class ForkTrial(Trial):
                 return None
             # What is left of a chunk beyond the fork's step was in the policy's queue then.
             rest = actions[len(logged) :]
-            actions = np.concatenate([logged, rest]) if len(rest) else logged
-        return super().on_actions(actions, directives, seconds=seconds)
+            decision = replace(decision, actions=np.concatenate([logged, rest]) if len(rest) else logged)
+        return super().on_actions(decision, seconds=seconds)
 
 
 def _other_actions(fork: Fork, step: int, own: np.ndarray, logged: np.ndarray) -> str:
@@ -199,17 +205,17 @@ class TeacherForcedRunner:
 
     def act(
         self, observations: Sequence, instructions: Sequence[str], histories: Sequence[ForcedState]
-    ) -> list[Chunk | PolicyError]:
+    ) -> Sequence[Decision | PolicyError]:
         for history in histories:
             if history.left <= 0 and history.stream is not None:
                 reseed: Any = getattr(self._host, "reseed")  # noqa: B009 - not every host has it
                 reseed(history.inner, history.stream)
                 history.stream = None
-        chunks = self._host.act(observations, instructions, [h.inner for h in histories])
-        for history, chunk in zip(histories, chunks, strict=True):
-            if not isinstance(chunk, PolicyError):
-                history.left -= len(chunk)
-        return chunks
+        decisions = self._host.act(observations, instructions, [h.inner for h in histories])
+        for history, decision in zip(histories, decisions, strict=True):
+            if not isinstance(decision, PolicyError) and isinstance(act := decision_of(decision), Act):
+                history.left -= len(act.actions)
+        return decisions
 
 
 @dataclass

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,7 @@ from lerobot_roborecover.policies.detectors.online import OnlineDetector
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.interventions.members import MemberHost
 from lerobot_roborecover.policies.interventions.takeover import TakeoverController
-from lerobot_roborecover.policies.runner import Chunk, PolicyError
-from lerobot_roborecover.workers.control_columns import BY_RULE, ControlColumns, Controller, append_columns
+from lerobot_roborecover.policies.runner import Act, Controller, InterventionMark, PolicyError, Rollback
 
 type Observation = Mapping[str, torch.Tensor]
 """After the env preprocessor, batch axis of 1."""
@@ -51,8 +50,8 @@ class InterventionState:
     """(n, A) actions still to be executed."""
     left: int = 0
     """Steps that the correction policy still has."""
-    first: ControlColumns = field(default_factory=ControlColumns)
-    """Control columns of the next action."""
+    mark: InterventionMark = field(default_factory=InterventionMark)
+    """Of the next action."""
     watch: DetectorHistory | None = None
     """The monitor's history of the trial; None without a monitor."""
 
@@ -85,8 +84,8 @@ class InterventionController:
         self._mode, self._takeover = mode, takeover
         self._watcher = None if monitor is None else OnlineDetector(as_detector(monitor), probe)
         self._correction_steps = correction_steps
-        self._rollback = BY_RULE if rewind_steps is None else rewind_steps
-        self._width = self.members[Controller.BASE].action_width
+        self._rewind_steps = rewind_steps
+        self.action_width = self.members[Controller.BASE].action_width
 
     def start(self, seed: int | None) -> InterventionState:
         """Starts a trial under the base policy.
@@ -107,8 +106,8 @@ class InterventionController:
         observations: Sequence[Observation],
         instructions: Sequence[str],
         episodes: Sequence[InterventionState],
-    ) -> list[Chunk | PolicyError]:
-        """Returns actions with control columns for slots that have no action left to execute.
+    ) -> list[Act | Rollback | PolicyError]:
+        """Returns decisions with marks for slots that have no action left to execute.
 
         Args:
             observations: of each slot.
@@ -116,9 +115,9 @@ class InterventionController:
             episodes: their trials, updated here.
 
         Returns:
-            Arrays (n, A + 5), see `workers.control_columns`. Where a member raised, its error instead.
+            One decision per slot. Where a member raised, its error instead.
         """
-        out: list[Chunk | PolicyError | None] = [None] * len(episodes)
+        out: list[Act | Rollback | PolicyError | None] = [None] * len(episodes)
         self._watch(observations, instructions, episodes, out)
         # A controller that hands its slot back is followed by the base policy in the same step.
         for controller in (Controller.HUMAN, Controller.CORRECTION, Controller.BASE):
@@ -151,7 +150,7 @@ class InterventionController:
         observations: Sequence[Observation],
         instructions: Sequence[str],
         episodes: Sequence[InterventionState],
-        out: list[Chunk | PolicyError | None],
+        out: list[Act | Rollback | PolicyError | None],
     ) -> None:
         pending = [i for i, e in enumerate(episodes) if e.pending]
         fires = dict.fromkeys(pending, True)
@@ -174,31 +173,26 @@ class InterventionController:
                 seconds = (time.perf_counter() - began) / len(part)
                 for i, score, trigger in zip(part, verdicts.scores, verdicts.triggers, strict=True):
                     fires[i] = bool(trigger) and not np.isnan(score)
-                    episodes[i].first = ControlColumns(
-                        controller=episodes[i].controller, asked=True, score=float(score), monitor_s=seconds
-                    )
+                    episodes[i].mark = InterventionMark(episodes[i].controller, True, float(score), seconds)
         for i in pending:
             if fires[i]:
                 out[i] = self._intervene(episodes[i], instructions[i])
 
-    def _intervene(self, episode: InterventionState, instruction: str) -> Chunk | None:
+    def _intervene(self, episode: InterventionState, instruction: str) -> Rollback | None:
         """Hands the slot over; the rollback itself, where that is what it takes."""
         episode.pending = False
-        told = episode.first
+        told = episode.mark
         if self._mode.endswith("reversion"):
             self._hand_over(episode, Controller.BASE)
-            episode.first = ControlColumns()
-            step_back = ControlColumns(
-                self._rollback, Controller.BASE, told.asked, told.score, told.monitor_s
-            )
-            return append_columns(np.zeros((1, self._width), np.float32), step_back)
+            episode.mark = InterventionMark()
+            return Rollback(self._rewind_steps, replace(told, controller=Controller.BASE))
         taker = Controller.HUMAN if self._mode == "human" else Controller.CORRECTION
         self._hand_over(episode, taker)
         if taker is Controller.HUMAN:
             episode.history = self._person().take(instruction)
         else:
             episode.left = self._correction_steps
-        episode.first = ControlColumns(0, taker, told.asked, told.score, told.monitor_s)
+        episode.mark = replace(told, controller=taker)
         return None
 
     # --- who
@@ -228,24 +222,23 @@ class InterventionController:
 
     def _driven(
         self, observation: Observation, instruction: str, episode: InterventionState
-    ) -> Chunk | PolicyError | None:
+    ) -> np.ndarray | PolicyError | None:
         """The person's next action; None where they have handed the slot back."""
         alone = {k: v[0] if isinstance(v, torch.Tensor) else v for k, v in observation.items()}
         action = self._person().act(episode.history, alone)
         if action is None:
             # The queue stays empty: the base policy is asked in the same step.
             self._hand_over(episode, Controller.BASE)
-            told = episode.first
-            episode.first = ControlColumns(0, Controller.BASE, told.asked, told.score, told.monitor_s)
+            episode.mark = replace(episode.mark, controller=Controller.BASE)
             return None
         action = np.asarray(action)
-        if action.shape != (self._width,) or not np.issubdtype(action.dtype, np.floating):
+        if action.shape != (self.action_width,) or not np.issubdtype(action.dtype, np.floating):
             return PolicyError(
-                f"the person's action is {action.dtype} {action.shape}, not floats ({self._width},)"
+                f"the person's action is {action.dtype} {action.shape}, not floats ({self.action_width},)"
             )
         return action[None]
 
-    def _next(self, episode: InterventionState) -> Chunk:
+    def _next(self, episode: InterventionState) -> Act:
         """Returns the actions to execute before the slot's next inference."""
         queue = episode.queue
         assert queue is not None
@@ -254,12 +247,12 @@ class InterventionController:
             take = min(take, episode.left)
         if episode.pending and self._watcher is not None:
             take = 1
-        rows = append_columns(np.ascontiguousarray(queue[:take]), episode.first)
+        decision = Act(np.ascontiguousarray(queue[:take]), episode.mark)
         episode.queue = queue[take:] if take < len(queue) else None
-        episode.first = ControlColumns(controller=episode.controller)
+        episode.mark = InterventionMark(episode.controller)
         if episode.controller is Controller.CORRECTION:
             episode.left -= take
             if not episode.left:
                 self._hand_over(episode, Controller.BASE)
-                episode.first = ControlColumns()
-        return rows
+                episode.mark = InterventionMark()
+        return decision

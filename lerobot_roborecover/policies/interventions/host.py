@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,14 @@ from lerobot.envs import preprocess_observation
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.policies.interventions.controller import InterventionController, InterventionState
-from lerobot_roborecover.policies.runner import Chunk, PolicyError, Processor
-from lerobot_roborecover.workers.control_columns import WIDTH
+from lerobot_roborecover.policies.runner import Act, Decision, PolicyError, Processor, Rollback
 
 _NOISE = ("per_trial", "per_batch", "unseeded")
 """From the best to the worst."""
 
 
 class InterventionHost:
-    """An `trials.host.PolicyRunner`.
+    """A `policies.runner.PolicyRunner`.
 
     Args:
         director: the composite policy.
@@ -67,8 +67,8 @@ class InterventionHost:
         observations: Sequence[Mapping[str, Any]],
         instructions: Sequence[str],
         histories: Sequence[InterventionState],
-    ) -> list[Chunk | PolicyError]:
-        """One chunk with directives per waiting slot."""
+    ) -> list[Decision | PolicyError]:
+        """One decision per waiting slot, with its mark."""
         prepared: list[dict[str, torch.Tensor] | PolicyError] = []
         for observation, instruction in zip(observations, instructions, strict=True):
             try:
@@ -76,25 +76,22 @@ class InterventionHost:
             except Exception as err:  # an observation that cannot be read costs its trial alone
                 prepared.append(PolicyError(f"{type(err).__name__}: {err}"))
         good = {i: p for i, p in enumerate(prepared) if not isinstance(p, PolicyError)}
-        chunks = self._director.act(
+        decisions = self._director.act(
             list(good.values()), [instructions[i] for i in good], [histories[i] for i in good]
         )
-        answers = dict(zip(good, chunks, strict=True))
-        return [
-            p if isinstance(p, PolicyError) else self._finished(answers[i]) for i, p in enumerate(prepared)
-        ]
-
-    def _finished(self, chunk: Chunk | PolicyError) -> Chunk | PolicyError:
-        return chunk if isinstance(chunk, PolicyError) else self._after(chunk)
+        answers = dict(zip(good, decisions, strict=True))
+        return [p if isinstance(p, PolicyError) else self._after(answers[i]) for i, p in enumerate(prepared)]
 
     def _prepare(self, observation: Mapping[str, Any], instruction: str) -> dict[str, torch.Tensor]:
         batch = {**preprocess_observation(_with_batch_axis(observation)), "task": [instruction]}
         return tensors(self._pre(self._env_pre(batch)))
 
-    def _after(self, rows: np.ndarray) -> np.ndarray:
+    def _after(self, decision: Act | Rollback | PolicyError) -> Decision | PolicyError:
         """The env type's own treatment of actions, as LeRobot's loop would apply it."""
-        actions = self._env_post({ACTION: torch.from_numpy(rows[:, :-WIDTH].copy())})[ACTION].numpy()
-        return np.concatenate([actions, rows[:, -WIDTH:]], axis=1)
+        if not isinstance(decision, Act):
+            return decision
+        actions = self._env_post({ACTION: torch.from_numpy(decision.actions.copy())})[ACTION].numpy()
+        return replace(decision, actions=actions)
 
 
 def tensors(batch: Mapping[str, Any]) -> dict[str, torch.Tensor]:

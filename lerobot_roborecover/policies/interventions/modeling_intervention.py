@@ -21,20 +21,20 @@ from lerobot_roborecover.policies.interventions.configuration_intervention impor
     MonitorConfig,
     RoboRecoverInterventionConfig,
 )
+from lerobot_roborecover.policies.interventions.control_columns import append_columns
 from lerobot_roborecover.policies.interventions.controller import InterventionController, InterventionState
 from lerobot_roborecover.policies.interventions.host import InterventionHost, tensors
 from lerobot_roborecover.policies.interventions.members import MemberHost, load_member
 from lerobot_roborecover.policies.interventions.options import POLICY_TYPE
 from lerobot_roborecover.policies.interventions.takeover import load_controller
-from lerobot_roborecover.policies.runner import PolicyError, Processor
-from lerobot_roborecover.workers.control_columns import Controller
+from lerobot_roborecover.policies.runner import Controller, PolicyError, Processor
 
 
 class RoboRecoverInterventionPolicy(PreTrainedPolicy):
     """A base policy with interventions. Has no weights of its own: saved, it names its members.
 
-    Actions carry five columns more than the environment's (`workers.control_columns`). The vector env takes
-    them off.
+    Under LeRobot's loop, actions carry five columns more than the environment's (`control_columns`). The
+    vector env takes them off.
     """
 
     # LeRobot declares both as None, for subclasses to replace.
@@ -95,7 +95,7 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """Next action of each slot, with its directive.
+        """Next action of each slot, with its columns.
 
         Args:
             batch: observations after the env preprocessor, and `task`.
@@ -118,15 +118,15 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
             self._episodes = [self.director.start(None) for _ in range(count)]
             self._rows = [[] for _ in range(count)]
         due = [i for i in range(count) if not self._rows[i]]
-        chunks = self.director.act(
+        decisions = self.director.act(
             [{k: v[i : i + 1] for k, v in observations.items()} for i in due],
             [instructions[i] for i in due],
             [self._episodes[i] for i in due],
         )
-        for i, chunk in zip(due, chunks, strict=True):
-            if isinstance(chunk, PolicyError):
-                raise chunk
-            self._rows[i] = list(chunk)
+        for i, decision in zip(due, decisions, strict=True):
+            if isinstance(decision, PolicyError):
+                raise decision
+            self._rows[i] = list(append_columns(decision, self.director.action_width))
         return torch.from_numpy(np.stack([rows.pop(0) for rows in self._rows]))
 
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:

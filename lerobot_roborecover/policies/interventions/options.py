@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.scenario import TrialStart
 
 POLICY_TYPE = "roborecover_intervention"
@@ -32,11 +32,7 @@ class InterventionFacts:
 
     def rollback_steps(self, scenario: TrialStart) -> int:
         """Returns the most steps that it may roll back on a scenario; 0 without rollback."""
-        if not self.rolls_back:
-            return 0
-        if self.rewind_steps is None:
-            return platform_named(scenario.platform).rewind_steps(scenario.task.horizon)
-        return self.rewind_steps
+        return resolve_rewind_steps(scenario, self.rewind_steps) if self.rolls_back else 0
 
     def name(self) -> str:
         """The composite policy in trial rows: `BASE monitor_correction(CORRECTION, MONITOR)`."""
