@@ -16,6 +16,7 @@ from lerobot_roborecover.policies import ema  # noqa: F401 - register types
 from lerobot_roborecover.policies.command_line import rewrite_env_argument
 from lerobot_roborecover.policies.detectors import register_detectors
 from lerobot_roborecover.policies.detectors.monitor import register_monitors
+from lerobot_roborecover.policies.interventions import configuration_intervention  # noqa: F401 - registers the policy
 from lerobot_roborecover.policies.remote import configuration_remote  # noqa: F401 - registers the policy
 from lerobot_roborecover.utils.signals import Terminated, handle, raise_terminated
 

@@ -210,6 +210,18 @@ def test_a_sound_policy_passes(run, tmp_path):
                           "inference time", "states fit the training data"}  # fmt: skip
 
 
+def test_a_policy_that_rolls_back_first(dataset, capsys, tmp_path):
+    base = save_policy(tmp_path / "act", "act")
+    status = main([
+        "check-policy", "--env=roborecover_fake", f"--env.scenarios={dataset}", "--policy.device=cpu",
+        "--policy.type=roborecover_intervention", "--policy.mode=reversion", f"--policy.base.path={base}",
+        "--eval.n_episodes=2", "--runner.slots=2", "--json",
+    ])  # fmt: skip
+    found = by_name(capsys.readouterr().out)
+    assert status == 0, found
+    assert found["actions"]["value"].startswith("5 of width 2")
+
+
 def test_a_table_with_remedies(run, tmp_path):
     """ACT is deterministic, which is a warning; its normaliser has no statistics, which is a failure."""
     policy = save_policy(tmp_path / "act", "act")
