@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
+from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, open_engine
 from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.work_items import units_of
@@ -72,7 +72,9 @@ def run_engine(dataset, log, host, stop=lambda: False, **options):
     run.pool.acquire()
     try:
         units = units_of(list(scenarios), TRIALS)
-        result = run_work_items(run, units, lambda: host, EngineConfig(slots=COUNT), stop=stop)
+        # Without the check of the first trials, which would stop the run before the other rows.
+        engine = open_engine(run, units, lambda: host, EngineConfig(slots=COUNT))
+        result = RunResult(engine.run(units, stop), engine.reruns, engine.unrun)
     finally:
         run.pool.release()
     return result, read_trial_log(log)
