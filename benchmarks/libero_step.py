@@ -18,7 +18,7 @@ import time
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 
-import numpy as np  # isort: skip - after lerobot_roborecover, which pins how it rounds (docs/exactness.md)
+import numpy as np  # isort: skip - after lerobot_roborecover, which pins how it rounds (docs/log/exactness.md)
 
 PARTS = ("step", "observe", "succeeded")
 

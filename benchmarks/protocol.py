@@ -24,7 +24,7 @@ from lerobot_roborecover.scenario import Scenario
 
 def measure(simulator: Simulator, scenario: Scenario, cache: SnapshotCache, steps: int) -> dict[str, float]:
     """One scenario's numbers: errors in millimetres, times in seconds."""
-    import numpy as np  # after lerobot_roborecover, which pins how it rounds (docs/exactness.md)
+    import numpy as np  # after lerobot_roborecover, which pins how it rounds (docs/log/exactness.md)
 
     replay = hand_off(simulator, scenario, cache=cache)
     again = hand_off(simulator, scenario, cache=cache)

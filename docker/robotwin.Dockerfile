@@ -1,4 +1,4 @@
-# RoboTwin 2.0 on a machine with an NVIDIA GPU (docs/robotwin.md). From the root of this repository:
+# RoboTwin 2.0 on a machine with an NVIDIA GPU (docs/platforms.md). From the root of this repository:
 #
 #     docker build -f docker/robotwin.Dockerfile -t roborecover-robotwin .
 #     docker run --rm --gpus all roborecover-robotwin roborecover doctor --platform robotwin

@@ -61,7 +61,7 @@ def test_the_libero_image_has_the_assets_that_the_package_downloads():
         f"ARG ROBOTWIN_ASSETS_REVISION={ASSETS_REVISION}"
         in (ROOT / "docker" / "robotwin.Dockerfile").read_text()
     )
-    assert f"--revision {ASSETS_REVISION}" in (ROOT / "docs" / "robotwin.md").read_text()
+    assert f"--revision {ASSETS_REVISION}" in (ROOT / "docs" / "platforms.md").read_text()
 
 
 def test_uv_is_held_to_hashes():

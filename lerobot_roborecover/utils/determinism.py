@@ -2,7 +2,7 @@
 
 OpenBLAS chooses its kernels by what the processor can do, and they round the last bit differently: with
 AVX-512 kernels instead of AVX2 ones no LIBERO state was the same, and contacts made up to 4.6 mm of it
-(docs/exactness.md). So simulators compute with the AVX2 kernels everywhere. NumPy's own dispatch, numba's
+(docs/log/exactness.md). So simulators compute with the AVX2 kernels everywhere. NumPy's own dispatch, numba's
 and the C library's made no difference.
 """
 

@@ -171,8 +171,7 @@ def test_lerobot_is_told_what_its_processor_gives(obs_type):
 
 
 def test_the_page_has_the_table():
-    page = (Path(__file__).parents[2] / "docs" / "platforms.md").read_text()
-    page = page.split("\n## LIBERO state observations\n")[1]
+    page = (Path(__file__).parents[2] / "docs" / "log" / "libero_state.md").read_text()
     rows = [line.strip("| ").split(" | ", 1) for line in page.splitlines() if line.startswith("| ")][1:]
     assert [name for _, name in rows] == [name for name, _ in ENVIRONMENT_STATE]
     ends = np.cumsum([width for _, width in ENVIRONMENT_STATE])

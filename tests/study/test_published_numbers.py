@@ -30,7 +30,7 @@ MODES = {
 }
 """Interventions by their names on the pages."""
 PAGES = {
-    "metaworld": ("docs/studies/metaworld.md",),
+    "metaworld": ("docs/log/metaworld_64.md",),
     "metaworld_recovery": ("README.md", "docs/studies/metaworld_recovery.md"),
     "libero": ("docs/studies/libero.md",),
 }

@@ -1,4 +1,4 @@
-"""What exact means across machines (docs/exactness.md).
+"""What exact means across machines (docs/log/exactness.md).
 
 On one machine a handoff is the same to the last bit, whatever came before; and the same as recorded, where
 the kernels are those of the recording. Elsewhere the last bit differs and contacts make more of it: then

@@ -30,7 +30,7 @@ on_standin = pytest.mark.skipif(
     bool(REAL), reason="about the stand-in, and ROBOTWIN_ROOT names a real checkout: unset it"
 )
 on_real = pytest.mark.skipif(
-    not REAL, reason="RoboTwin's own code: set ROBOTWIN_ROOT=CHECKOUT (docs/robotwin.md)"
+    not REAL, reason="RoboTwin's own code: set ROBOTWIN_ROOT=CHECKOUT (docs/platforms.md)"
 )
 
 

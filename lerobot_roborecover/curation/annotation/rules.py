@@ -1,6 +1,6 @@
 """From what the page shows to a verdict: the rules of the automatic annotators, after the page's own guide.
 
-docs/labels.md, lists them. They see the numbers of the readout at the frames that were
+docs/log/automatic_labels.md, lists them. They see the numbers of the readout at the frames that were
 looked at, the instruction's object (the one with a goal) and the line above the frames; not the simulator.
 """
 
