@@ -82,8 +82,8 @@ def test_parts_become_one_and_say_what_they_said(parts, tmp_path):
     assert "meta/roborecover/steps.parquet" in list_files(root)
     assert [p.name for p in tmp_path.iterdir()] == ["all"]
     assert attrition_table(count_stages(read_decisions(root))).splitlines()[1:] == [
-        "collect           4        3        1          0",
-        "                                    1  stuck",
+        "collect        4     3          0        1",
+        "                                         1  stuck",
     ]
     # An exclusion is a decision like another: a person may take it back, and both stay on record.
     assert queued(found) == {"ep-0000", "ep-0002", "ep-0003"}
