@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 
+import pytest
+
 from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.figures import glyphs
 from lerobot_roborecover.analysis.figures.glyphs import drawable, families
@@ -33,6 +35,7 @@ def test_an_installed_font_is_used(monkeypatch):
         families.cache_clear()
 
 
+@pytest.mark.nightly
 def test_no_figure_of_a_report_shows_a_box(tmp_path):
     logs = [
         str(write_log(tmp_path / f"{n}.jsonl", policy_rows(name, 8, 2, 0.5, n, task="把碗放在盘子上")))

@@ -249,9 +249,8 @@ def test_a_scenario_counts_when_its_turn_has_come(dataset):
     run.log.close()
 
     def row(scenario):
-        return {
-            "scenario_id": scenario.id, "trial": 0, "start": "recovery", "success": True, "outcome": "success",
-        }  # fmt: skip
+        found = {"scenario_id": scenario.id, "trial": 0, "start": "recovery"}
+        return {**found, "success": True, "outcome": "success"}
 
     watch.add([row(s) for s in watch.order[1:5]])
     assert watch.rate is None

@@ -337,6 +337,7 @@ def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, t
     assert take_trials(tmp_path / "part-0" / "calm", tmp_path / "out.trials" / "calm") == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):
     from tests.support.push_checkpoints import load_push_host

@@ -95,6 +95,7 @@ def test_an_owner_s_benchmark_stays_and_tables_of_splits_that_are_gone_leave(hub
     assert files["eval.yaml"] == b"name: my own\n"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_scenarios_stream_into_datasets(hub, client, local):
     published(hub, client, local)

@@ -160,6 +160,7 @@ def test_both_starts_are_run_and_reported(settings, capsys):
     assert {r.start for r in rows} == {"recovery", "initial"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_finished_demo_runs_nothing_again(settings):
     run_demo(settings())

@@ -240,6 +240,7 @@ def test_forks_that_teach_nothing_are_refused(dataset, policy, forks, tmp_path, 
     refused("the log has no forks", "--forks", str(plain))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_is_said_in_use_is_what_was_measured(measured, dataset, policy, tmp_path):
     """A saved detector in the composite policy triggers where its measured score first passes the threshold,

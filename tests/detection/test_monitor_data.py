@@ -204,6 +204,7 @@ def test_recorded_continuations_are_taken_where_they_fit(continuations, tmp_path
     }
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_the_command_runs_policies_once_and_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     """Through the local engine; recorded actions are those that the log has the hash of."""

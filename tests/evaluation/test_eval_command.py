@@ -126,6 +126,7 @@ def test_shards_come_together(run, whole, tmp_path, capsys):
     assert outcomes(read_trial_log(merged)) == whole
 
 
+@pytest.mark.nightly
 def test_sequential_alone_and_against_a_log(run, whole, capsys):
     other = run("--sequential")
     assert outcomes(rows_of(other)) == whole

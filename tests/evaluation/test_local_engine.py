@@ -101,7 +101,7 @@ def test_noise_belongs_to_the_trial_not_to_the_batch(dataset, tmp_path):
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(stops=st.lists(st.integers(0, 200), max_size=3))
 def test_stopped_and_resumed(dataset, reference, tmp_path_factory, stops):
     log = tmp_path_factory.mktemp("s") / "log.jsonl"

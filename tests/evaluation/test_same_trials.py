@@ -74,6 +74,7 @@ def test_corrected_statistics(run, tmp_path):
     assert again == rows, "the corrected ones are there"
 
 
+@pytest.mark.nightly
 def test_another_number_of_inference_steps(run, tmp_path, capfd):
     policy = save_policy(tmp_path / "diffusion", "diffusion")
     run(f"--policy.path={policy}", "--policy.num_inference_steps=3")
@@ -112,6 +113,7 @@ def _server(metadata=None):
         yield f"--policy.url={url}"
 
 
+@pytest.mark.nightly
 def test_a_corrected_mapping_and_another_server(run, tmp_path):
     mapping = tmp_path / "mine.yaml"
     mapping.write_text(MAPPING + "actions: {scale: [1.0, 2.0]}\n")

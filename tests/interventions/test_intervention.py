@@ -184,6 +184,7 @@ def test_a_person_at_the_page_takes_over_under_both_evaluators(
     driving.join()
 
 
+@pytest.mark.nightly
 def test_a_trigger_never_reaches_another_slot(dataset, checkpoints, monitor, tmp_path):
     """Four slots at once give what one slot gives; diffusion is asked slot by slot, so bit for bit."""
     made = composite(checkpoints, "monitor_correction", base="diffusion")

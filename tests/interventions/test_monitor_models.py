@@ -247,6 +247,7 @@ def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(base):
     assert (after.scores[1::2] > 0.5).all()
 
 
+@pytest.mark.nightly
 def test_the_small_monitor_reads_what_it_is_told_to(data, tmp_path):
     kind = options("monitor_small", data, Path())
     lerobot_train(
@@ -262,6 +263,7 @@ def test_the_small_monitor_reads_what_it_is_told_to(data, tmp_path):
         )
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", BOTH)
 def test_a_monitor_is_measured_on_held_out_frames_only(kind, data, trained, tmp_path, capsys, monkeypatch):
     argv = ["detect", "evaluate-frames", "--monitor", str(final(trained(kind))), "--device", "cpu"]

@@ -363,6 +363,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_an_environment_on_the_hub_at_a_commit(tmp_path):

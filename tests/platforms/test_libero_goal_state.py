@@ -58,6 +58,7 @@ def test_what_is_closed_is_closed_last():
     ]
 
 
+@pytest.mark.nightly
 def test_a_bowl_on_its_way_to_a_plate(sim):
     from lerobot_roborecover.platforms.libero.expert import LiberoExpert
     from lerobot_roborecover.platforms.libero.scene import LiberoScene
@@ -194,6 +195,7 @@ def test_trials_say_which_fast_pictures_they_saw(options, said):
     assert ("fast_pictures" in decisive) == said
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_progress_is_the_share_of_goals_that_hold(sim):
     """Two objects into one place, one after the other: none, half, all, and all exactly on success."""

@@ -20,6 +20,7 @@ def task_named(part: str):
     return next(t for t in PLATFORM.tasks() if part in f"{t.suite}/{t.name}")
 
 
+@pytest.mark.nightly
 def test_an_object_that_is_placed_on_another_is_wanted_where_that_one_is(simulator):
     task = task_named("libero_goal/put_the_bowl_on_the_plate")
     simulator.reset(task, Reset(seed=7, init_state_index=0))
@@ -47,6 +48,7 @@ def test_each_of_two_goals_has_its_mark_and_the_traces_show_both(simulator):
     assert np.array_equal(wanted, inside)
 
 
+@pytest.mark.nightly
 def test_a_drawer_is_wanted_where_it_is_closed_by_its_handle(simulator):
     simulator.reset(task_named("put_the_black_bowl_in_the_bottom_drawer"), Reset(seed=7, init_state_index=0))
     poses = simulator.bodies()
@@ -63,6 +65,7 @@ def test_a_drawer_is_wanted_where_it_is_closed_by_its_handle(simulator):
     assert shut[drawer + GOAL_OF].distance_m(poses[drawer + GOAL_OF]) < 1e-3, "the place stays where it is"
 
 
+@pytest.mark.nightly
 def test_a_goal_about_what_turns_has_no_mark(simulator):
     simulator.reset(task_named("libero_goal/turn_on_the_stove"), Reset(seed=7, init_state_index=0))
     assert not any(map(is_mark, simulator.bodies()))

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.libero
 
 STEPS = 24
 TASKS = [(suite, index) for suite, names in libero_tasks().items() for index in range(len(names))]
-SOME = [("libero_object", 0), ("libero_10", 2)]
+SOME = [("libero_10", 2)]
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,7 @@ def test_every_step_is_robosuites_own(sim, suite, index):
     assert len({row["sha256"] for row in ours}) > STEPS - 5, "nothing moved"
 
 
+@pytest.mark.nightly
 def test_a_snapshot_goes_on_with_either(sim):
     task, steps = task_of(*SOME[0]), actions(12)
     sim.reset(task, Reset(seed=7, init_state_index=1))
@@ -151,6 +152,7 @@ def test_another_robot_or_robosuite_is_robosuites_to_run(sim, monkeypatch):
     assert osc.osc_control(sim.libero_env) is None
 
 
+@pytest.mark.nightly
 def test_contacts_are_robosuites(sim):
     """All pairs of objects and fixtures, the fingers, and names of every kind that robosuite takes."""
     sim.reset(task_of("libero_spatial", 4), Reset(seed=7, init_state_index=1))
@@ -172,6 +174,7 @@ def test_contacts_are_robosuites(sim):
     assert seen == {True, False}
 
 
+@pytest.mark.nightly
 def test_boxes_of_many_bodies_are_those_of_each(sim):
     from lerobot_roborecover.platforms.libero.boxes import BodyBoxes
     from lerobot_roborecover.platforms.mujoco_state import subtree

@@ -274,6 +274,7 @@ def test_snapshot_continues_like_a_replay(sim, at):
     fresh.close()
 
 
+@pytest.mark.nightly
 def test_snapshot_of_another_task_is_refused(sim):
     sim.reset(task_of("libero_spatial", 4), Reset(seed=7, init_state_index=0))
     snapshot = sim.snapshot()
@@ -284,6 +285,7 @@ def test_snapshot_of_another_task_is_refused(sim):
         sim.restore(b"not a snapshot")
 
 
+@pytest.mark.nightly
 @pytest.mark.render
 def test_rendering_does_not_touch_the_physics(sim):
     task, reset = task_of("libero_goal", 3), Reset(seed=7, init_state_index=1)

@@ -55,6 +55,7 @@ def simulator():
     made.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", EACH_TASK)
 def test_same_seed_same_states_whatever_came_before(simulator, name):
     actions = downward_actions(60)
@@ -112,6 +113,7 @@ def test_snapshot_continues_like_the_replay(simulator, name):
         assert other.succeeded() is succeeded
 
 
+@pytest.mark.nightly
 def test_step_assigns_no_attribute_that_a_snapshot_lacks(simulator):
     """Guards `STEP_ATTRIBUTES` against a task that starts to keep state in Python."""
     from lerobot_roborecover.platforms.metaworld.scene import STEP_ATTRIBUTES
@@ -271,6 +273,7 @@ def test_a_snapshot_of_another_task_is_refused(simulator):
         simulator.restore(snapshot)
 
 
+@pytest.mark.nightly
 @pytest.mark.render
 def test_rendering_leaves_the_states_alone(simulator):
     actions = downward_actions(12)

@@ -178,6 +178,7 @@ def test_under_lerobot_eval_a_lost_server_ends_the_run(lerobot_eval, tmp_path):
         lerobot_eval(*remote(url, write_mapping(tmp_path)))
 
 
+@pytest.mark.nightly
 def test_retry_runs_logged_trials_again_and_keeps_the_old_rows(evaluate, tmp_path, capsys):
     import json
 

@@ -43,6 +43,7 @@ def reproduce(config, tmp_path):
     return call
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_score_that_is_reached_is_confirmed(reproduce, capfd):
     """A random policy solves nothing, which is what is published."""

@@ -76,6 +76,7 @@ def test_votes_of_several_raters_become_points(tmp_path, capsys):
     assert "frame 999 is not from 1 to" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 def test_a_second_rater_scores_the_recordings_blind(tmp_path):
     import threading
 
