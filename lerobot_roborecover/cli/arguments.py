@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.utils.options import Option, make, options_of
+from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.utils.options import Option, checkpoints_of, make, options_of
+from lerobot_roborecover.utils.text import nearest
 
 
 class _RefusedError(Exception):
@@ -59,13 +63,6 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
-    """Returns the name that is most like a word; empty where none is."""
-    from difflib import get_close_matches
-
-    return next(iter(get_close_matches(word, known, 1)), "")
-
-
 def add_options(parser: argparse.ArgumentParser, kind: type) -> None:
     """Adds the options of a dataclass.
 
@@ -90,6 +87,22 @@ def add_options(parser: argparse.ArgumentParser, kind: type) -> None:
 def read_options[Options](kind: type[Options], namespace: argparse.Namespace) -> Options:
     """Makes a command's dataclass from the arguments that `add_options` added."""
     return make(kind, vars(namespace))
+
+
+def check_checkpoints(options: Any) -> None:
+    """Refuses a policy's checkpoint that cannot be loaded, before the command imports LeRobot.
+
+    Args:
+        options: the command's dataclass.
+
+    Raises:
+        OptionError: naming the option, and what is nearest to it.
+    """
+    for name, text in checkpoints_of(options):
+        label, path = f"--{name}={text}", text
+        if re.match(r"[A-Za-z0-9][\w.-]*=", text) and not Path(text).exists():
+            path = text.partition("=")[2]
+        check_checkpoint(path, label)
 
 
 def _settings(one: Option) -> dict[str, Any]:

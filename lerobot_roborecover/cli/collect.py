@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.curation.collect.options import CollectOptions
+from lerobot_roborecover.evaluation.early_checks import ENV, CommandLine, ConfigSource, join_values
 
 HELP = "Roll out a policy or a scripted controller from initial states, and keep its failures as candidates."
 
@@ -21,12 +22,14 @@ class CollectCommand(CollectOptions):
 
 
 OPTIONS = CollectCommand
+LEROBOTS = ConfigSource("roborecover curate collect", required=(ENV,))
+"""Options that LeRobot's parser reads."""
 
 
 class CollectParser(Parser):
     """The command's own parser; `--policy.*` and `--env.*` are LeRobot's."""
 
-    passes = ("--policy.", "--env.")
+    passes = ("--policy.", "--env.", "--env")
 
 
 def build_parser() -> CollectParser:
@@ -48,6 +51,8 @@ def pass_through(argv: Sequence[str]) -> int:
 
     parser = build_parser()
     args, rest = parser.parse_known_args(pairs(argv))
+    if args.expert != "?":
+        CommandLine(LEROBOTS, rest).check()
     if args.expert == "?":
         from lerobot_roborecover.curation.collect.experts import list_experts
 
@@ -71,15 +76,9 @@ def pass_through(argv: Sequence[str]) -> int:
 
 
 def pairs(argv: Sequence[str]) -> list[str]:
-    """`--policy.path X` and `--env.type X` as `--policy.path=X`."""
-    joined: list[str] = []
-    for word in argv:
-        bare = joined and joined[-1].startswith(("--policy.", "--env.")) and "=" not in joined[-1]
-        if bare and not word.startswith("--"):
-            joined[-1] = f"{joined[-1]}={word}"
-        else:
-            joined.append(word)
-    return joined
+    """`--policy.path X` and `--env.type X` as `--policy.path=X`, and `--env X` as `--env.type=X`."""
+    words = join_values(argv, CollectParser.passes)
+    return [f"--env.type={w.removeprefix('--env=')}" if w.startswith("--env=") else w for w in words]
 
 
 def options(parser: Parser, given: CollectOptions, rest: list[str]) -> CollectOptions:

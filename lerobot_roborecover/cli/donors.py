@@ -33,7 +33,7 @@ class DonorDataOptions:
     """Take this split of it only."""
     base: str
     """The base policy: its checkpoint, or its name in the logs."""
-    donors: tuple[str, ...] = option((), name="donor", metavar="CHECKPOINT")
+    donors: tuple[str, ...] = option((), name="donor", metavar="CHECKPOINT", checkpoint=True)
     """An alternative that is in the logs: run its four trials; give it again for each."""
     trials_from: tuple[Path, ...] = option((), metavar="DIR")
     """Trials with their actions, as an earlier run left them in its --work: read instead of run."""

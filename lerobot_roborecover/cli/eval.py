@@ -5,9 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.cli.config_command import run_config_command
+from lerobot_roborecover.evaluation.early_checks import ENV, POLICY, ConfigSource
+from lerobot_roborecover.evaluation.short_names import ALIASES
 
 HELP = "evaluate a policy, every simulator busy; takes lerobot-eval's arguments and --runner.*"
+SOURCE = ConfigSource(
+    "roborecover eval",
+    ("lerobot_roborecover.evaluation.runner", "RecoveryEvalConfig"),
+    required=(ENV, POLICY),
+    short=ALIASES,
+)
 
 
 def pass_through(argv: Sequence[str]) -> int:
@@ -15,14 +23,4 @@ def pass_through(argv: Sequence[str]) -> int:
     # Before torch is loaded: threads of a policy on the CPU that spin while they wait for each other take the
     # cores from the simulators. It changes no number.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    _check_folder(argv)
-    from lerobot_roborecover.evaluation.runner import main
-
-    return main(argv)
-
-
-def _check_folder(argv: Sequence[str]) -> None:
-    """Refuses a checkpoint's folder that cannot be used before LeRobot is imported, which takes 10 s."""
-    for name, _, path in (argument.partition("=") for argument in argv):
-        if name == "--policy.path" and (path.startswith(("/", "./", "../")) or os.path.isdir(path)):
-            check_checkpoint(path)
+    return run_config_command(SOURCE, "lerobot_roborecover.evaluation.runner:main", argv, HELP)

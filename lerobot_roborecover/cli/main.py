@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from lerobot_roborecover._version import __version__
-from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
+from lerobot_roborecover.cli.arguments import Parser, add_options, check_checkpoints, read_options
 from lerobot_roborecover.cli.guard import guarded
 from lerobot_roborecover.cli.tree import (
     COMMANDS,
@@ -94,7 +94,9 @@ def _run(call: Call) -> int:
     if hasattr(module, "pass_through"):
         return module.pass_through(list(call.rest))
     args = command_parser(call).parse_args(call.rest)
-    return module.run(read_options(module.OPTIONS, args))
+    options = read_options(module.OPTIONS, args)
+    check_checkpoints(options)
+    return module.run(options)
 
 
 class _ListParser(Parser):

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lerobot_roborecover.cli.config_command import run_config_command
+from lerobot_roborecover.evaluation.early_checks import ConfigSource
+
 HELP = (
     "Run a plan of recovery points and policies on a robot, blind and in random order; takes LeRobot's "
     "--robot.* and --teleop.*."
+)
+SOURCE = ConfigSource(
+    "roborecover robot run",
+    ("lerobot_roborecover.robot.commands", "PlanRunConfig"),
+    chosen=(),
 )
 
 
 def pass_through(argv: Sequence[str]) -> int:
     """Hands the command line to LeRobot's parser."""
-    from lerobot_roborecover.utils.plugins import register_plugins
-
-    register_plugins()
-    from lerobot_roborecover.robot.commands import run_plan
-
-    return run_plan(argv)
+    return run_config_command(SOURCE, "lerobot_roborecover.robot.commands:run_plan", argv, HELP)

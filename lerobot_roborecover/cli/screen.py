@@ -19,7 +19,7 @@ HELP = (
 class ScreenOptions(ScreenRequest):
     """What to screen; policies and their options as they are written on a command line."""
 
-    policy: tuple[str, ...] = option((), metavar="[NAME=]CHECKPOINT")
+    policy: tuple[str, ...] = option((), metavar="[NAME=]CHECKPOINT", checkpoint=True)
     """A screening policy, folder or Hub id; give it again for each (the paper has four)."""
     env_option: tuple[str, ...] = option((), name="env", metavar="[NAME:]KEY=VALUE")
     """Option of the recovery env type, for one policy where its name stands before it; may be given again."""

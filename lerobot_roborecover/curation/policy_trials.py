@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lerobot_roborecover.evaluation.early_checks import check_env_options
 from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
@@ -164,6 +165,7 @@ def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> Re
         scenarios: shipped name, folder or Hub id.
         options: `--name=value`, as after `--env.`.
     """
+    check_env_options(platform, options)
     import draccus
 
     from lerobot_roborecover.evaluation.env_configs import env_type

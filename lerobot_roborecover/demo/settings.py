@@ -43,7 +43,7 @@ class DemoSettings:
 
     out: Path = Path("outputs/demo")
     """Folder of the results; rerun to go on."""
-    policy: str = option("", name="policy.path", metavar="POLICY", show_default=False)
+    policy: str = option("", name="policy.path", metavar="POLICY", show_default=False, checkpoint=True)
     """Folder or Hub id of another Meta-World policy.
 
     Empty: the shipped one, whose folder stands here then.

@@ -40,7 +40,7 @@ class TrialSource:
 
     scenarios: str = option("", show_default=False)
     """Scenario set: folder, Hub id or shipped name."""
-    policy: str = option("", metavar="CHECKPOINT", show_default=False)
+    policy: str = option("", metavar="CHECKPOINT", show_default=False, checkpoint=True)
     """Policy that acts in the trials, and is watched."""
     work: Path = internal(Path("outputs/detectors.work"))
     """Folder of trials and observations."""

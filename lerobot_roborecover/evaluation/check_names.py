@@ -14,6 +14,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.evaluation.check_numbers import Stats, statistics_problem
+from lerobot_roborecover.evaluation.missing_inputs import BLANK
 from lerobot_roborecover.platforms.findings import Check, failure, ok, warning
 from lerobot_roborecover.policies.load_problems import other_action_width
 
@@ -78,7 +79,7 @@ def check_camera_names(cameras: Mapping[str, str]) -> Check:
 
 
 def check_features(
-    wanted: Mapping[str, Any], given: Mapping[str, tuple[int, ...]], kind: str, renamed: bool
+    wanted: Mapping[str, Any], given: Mapping[str, tuple[int, ...]], kind: str, remedy: str
 ) -> Check:
     """The policy's inputs against what the env gives.
 
@@ -86,16 +87,15 @@ def check_features(
         wanted: the checkpoint's `input_features`.
         given: shapes of the observation as the policy's preprocessor gets it, after renaming.
         kind: policy type.
-        renamed: whether there is a rename map.
+        remedy: what gives the inputs that are missing (`input_remedy`).
     """
-    hint = "" if renamed else ' Give --rename_map=\'{"observation.images.head_camera": "..."}\'.'
     have = ", ".join(f"{k} {tuple(s)}" for k, s in given.items())
     problems, missing_pictures, pictures = [], [], 0
     for key, feature in wanted.items():
         shape = given.get(key)
         if feature.type is FeatureType.VISUAL:
             pictures += 1
-            if shape is None and "empty_camera" not in key:
+            if shape is None and BLANK not in key:
                 missing_pictures.append(key)
         elif shape is None:
             problems.append(f"{key} {tuple(feature.shape)} is missing")
@@ -106,12 +106,12 @@ def check_features(
     if problems:
         return failure(
             "inputs", "; ".join(problems), "what the checkpoint was trained on",
-            f"the env gives {have}.{hint} A checkpoint for another robot cannot be evaluated here",
+            f"{remedy or 'take a checkpoint for this robot'}. The env gives {have}",
         )  # fmt: skip
     if missing_pictures:
         return warning(
             "inputs", f"not given: {', '.join(missing_pictures)}", "every camera it was trained on",
-            f"most policies take a blank picture in its place. The env gives {have}.{hint}",
+            f"{remedy}. Most policies take a blank picture in its place. The env gives {have}",
         )  # fmt: skip
     if kind in ("act", "diffusion", "vqbet", "tdmpc"):
         for key, feature in wanted.items():

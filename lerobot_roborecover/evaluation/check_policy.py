@@ -24,8 +24,10 @@ from lerobot_roborecover.evaluation import check_names as names
 from lerobot_roborecover.evaluation import check_numbers as numbers
 from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scenario, take_steps
 from lerobot_roborecover.evaluation.loading import load_host
+from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
+from lerobot_roborecover.evaluation.short_names import JSON, long_names
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.findings import (
     Check,
@@ -36,7 +38,7 @@ from lerobot_roborecover.platforms.findings import (
     warning,
 )
 from lerobot_roborecover.policies.command_line import run_with_arguments
-from lerobot_roborecover.policies.load_problems import load_remedy
+from lerobot_roborecover.policies.load_problems import error_words, load_remedy
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import Act, PolicyError, PolicyRunner, WatchedHost, decision_of
@@ -45,8 +47,6 @@ from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
 from lerobot_roborecover.workers.messages import EpisodeStart
 
-SHORT = {"--json": "--check.json=true"}
-"""What this command has and `lerobot-eval` does not, by its short name."""
 _RECORDED = 50
 """Scenarios whose prefixes are compared with the checkpoint's statistics, at most."""
 
@@ -103,7 +103,8 @@ def examine(cfg: CheckPolicyConfig) -> list[Check]:
         try:
             host = load_host(host_spec(cfg))
         except Exception as err:  # a checkpoint may fail to load in any way
-            return [_not_loaded(err), *findings]
+            remedy = input_remedy(cfg.recovery_env, wanted, cfg.rename_map)
+            return [_not_loaded(err, remedy), *findings]
         watched = WatchedHost(host, run.policy_watchdog_s)
         run.pool.on_close(watched.close)
         findings.insert(0, ok("loads", f"{config.type} on {config.device}"))
@@ -158,9 +159,9 @@ def _cameras(cfg: CheckPolicyConfig) -> dict[str, str]:
     return found
 
 
-def _not_loaded(err: Exception) -> Check:
-    text = f"{type(err).__name__}: {err}".splitlines()[0]
-    remedy = load_remedy(err) or "see the message; 'roborecover doctor' checks what is installed"
+def _not_loaded(err: Exception, inputs: str) -> Check:
+    text = f"{type(err).__name__}: {error_words(err)}"
+    remedy = load_remedy(err, inputs) or "see the message; 'roborecover doctor' checks what is installed"
     return failure("loads", text, "a policy with its processors", remedy)
 
 
@@ -190,7 +191,9 @@ def _look(
     tensors = {cfg.rename_map.get(k, k): v for k, v in batch.items() if hasattr(v, "shape")}
     shapes = {k: tuple(v.shape[1:]) for k, v in tensors.items()}
     found = [
-        names.check_features(wanted, shapes, config.type, bool(cfg.rename_map)),
+        names.check_features(
+            wanted, shapes, config.type, input_remedy(cfg.recovery_env, wanted, cfg.rename_map, shapes)
+        ),
     ]
     in_stats, _ = names.statistics_of(pre)
     out_stats, _ = names.statistics_of(post)
@@ -307,6 +310,5 @@ def main(argv: Sequence[str]) -> int:
     from lerobot_roborecover.policies.command_line import rewrite_env_argument
 
     init_logging()
-    long = [SHORT.get(argument, argument) for argument in argv]
-    program, *words = rewrite_env_argument(["roborecover-eval", *long])
+    program, *words = rewrite_env_argument(["roborecover-eval", *long_names(argv, JSON)])
     return run_with_arguments(check, program, words)

@@ -13,7 +13,9 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.early_checks import check_policy_options
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
+from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import plain_parsing
@@ -55,13 +57,13 @@ def policy_config(policy: str, options: Sequence[str] = (), device: str | None =
     Raises:
         OptionError: there is no such checkpoint, it is not whole, or an option is not one of its policy's.
     """
+    check_policy_options(policy, options)
     import lerobot.policies  # noqa: F401 - registers LeRobot's policy types
 
     from lerobot_roborecover.policies.interventions import configuration_intervention  # noqa: F401 - and ours
     from lerobot_roborecover.policies.remote import configuration_remote  # noqa: F401
 
     register_plugins()
-    check_checkpoint(policy)
     overrides = [f"--{o.removeprefix('--')}" for o in options]
     overrides += [f"--device={device}"] if device else []
     with plain_parsing(f"--policy.path={policy}", ValueError, TypeError, KeyError):
@@ -86,7 +88,8 @@ def load_host(spec: HostSpec) -> PolicyRunner:
             f"--policy.path={spec.policy.pretrained_path}: its actions have {other} values, {spec.env.type} "
             f"takes {width}. The checkpoint is for another robot or another kind of action"
         )
-    with plain_loading(f"--policy.path={path}"):
+    wanted = spec.policy.input_features or {}
+    with plain_loading(f"--policy.path={path}", lambda: input_remedy(spec.env, wanted, spec.rename_map)):
         return _load_host(spec)
 
 

@@ -21,8 +21,9 @@ from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
 from lerobot_roborecover.evaluation.loading import HostSpec, load_host
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
-from lerobot_roborecover.evaluation.sequential import ALONE, open_watch
+from lerobot_roborecover.evaluation.sequential import open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
+from lerobot_roborecover.evaluation.short_names import ALIASES, long_names
 from lerobot_roborecover.evaluation.videos import SAMPLE, VideoRecorder, video_trial
 from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue, units_of
 from lerobot_roborecover.logs.extent import missing
@@ -39,16 +40,6 @@ from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.backend import Backend
 
 logger = logging.getLogger(__name__)
-
-ALIASES = {
-    "engine": "runner.engine",
-    "videos": "runner.videos",
-    "limit-seconds": "runner.limit_seconds",
-    "sequential": "runner.sequential",
-    "shard": "env.shard",
-    "retry": "runner.retry",
-}
-"""Short names of options that this command has and `lerobot-eval` does not."""
 
 
 @dataclass
@@ -358,22 +349,5 @@ def main(argv: Sequence[str]) -> int:
     from lerobot_roborecover.policies.command_line import rewrite_env_argument
 
     init_logging()
-    program, *words = rewrite_env_argument(["roborecover-eval", *_long_names(argv)])
+    program, *words = rewrite_env_argument(["roborecover-eval", *long_names(argv, ALIASES)])
     return run_with_arguments(evaluate, program, words)
-
-
-def _long_names(argv: Sequence[str]) -> list[str]:
-    """All arguments under their long names; `--sequential` without a log is given its value."""
-    found = [_long_name(argument) for argument in argv]
-    for k, name in enumerate(found):
-        if name == "--runner.sequential" and (k + 1 == len(found) or found[k + 1].startswith("--")):
-            found[k] = f"{name}={ALONE}"
-    return found
-
-
-def _long_name(argument: str) -> str:
-    """`--videos=3` as `--runner.videos=3`, and the like."""
-    name, _, value = argument.removeprefix("--").partition("=")
-    if not argument.startswith("--") or name not in ALIASES:
-        return argument
-    return f"--{ALIASES[name]}={value}" if value else f"--{ALIASES[name]}"

@@ -128,6 +128,13 @@ class Platform(TaskCatalog):
     several platforms."""
     env_defaults: ClassVar[Mapping[str, Any]] = {}
     """Options of that env type that name this platform, nested as in a configuration file."""
+    env_config_class: ClassVar[str] = ""
+    """`module:Class` of LeRobot's `EnvConfig` of the platform; see `env_config`."""
+    observation_options: ClassVar[tuple[tuple[str, Any], ...]] = (
+        ("obs_type", "state"),
+        ("obs_type", "pixels_agent_pos"),
+    )
+    """Env options (name, value) that give a policy other inputs, for the remedy where one is missing."""
 
     def resolve(self, options: Sequence[str]) -> Platform:
         """The platform that options of the env type choose, where it serves several.
@@ -327,8 +334,14 @@ class Platform(TaskCatalog):
     def env_config(self) -> type:
         """LeRobot's `EnvConfig` of the platform: a dataclass with `simulator_setup() -> SimulatorSetup`,
         which raises `OptionError` for what cannot be used. Imports LeRobot. The options of recovery
-        evaluation (`RecoveryOptions`) are added to it where it is registered."""
-        raise NotImplementedError
+        evaluation (`RecoveryOptions`) are added to it where it is registered.
+
+        Set `env_config_class`, or override this; with the former, a wrong option is refused before LeRobot
+        is imported."""
+        if not self.env_config_class:
+            raise NotImplementedError(f"platform {self.name} sets no env_config_class")
+        module, _, name = self.env_config_class.partition(":")
+        return getattr(importlib.import_module(module), name)
 
     # --- the machine
 

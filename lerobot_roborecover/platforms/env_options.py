@@ -15,20 +15,39 @@ if TYPE_CHECKING:
     from lerobot.envs.configs import EnvConfig
 
 
-def refuse_unused(config: EnvConfig, base: type[EnvConfig], names: tuple[str, ...]) -> None:
+SETTLED = (
+    "task", "task_ids", "episode_length", "init_states", "hard_reset", "is_libero_plus", "multitask_eval",
+)  # fmt: skip
+"""Options of LeRobot's own envs that a scenario settles by itself."""
+NOT_OPTIONS = (*SETTLED, "features", "features_map", "render_mode", "disable_env_checker")
+"""Fields of env configurations that no user sets."""
+LEROBOT_OPTIONS: Mapping[str, str] = {
+    "fps": "Control rate, Hz; leave it as it is: recorded prefixes are of that rate.",
+    "obs_type": "What the policy sees: `pixels`, `pixels_agent_pos`, or `state`, which renders nothing.",
+    "camera_name": "Cameras that are rendered, separated by commas.",
+    "camera_names": "Cameras that are rendered, separated by commas.",
+    "camera_name_mapping": "LeRobot's name of each camera, as JSON.",
+    "observation_height": "Height of the policy's pictures, pixels.",
+    "observation_width": "Width of the policy's pictures, pixels.",
+    "control_mode": "What the policy's actions are: `relative` or `absolute`.",
+    "action_mode": "What an action commands: `joint` positions, or `ee` (end-effector) poses.",
+}
+"""What LeRobot's own env options are, where LeRobot's source does not say it."""
+
+
+def refuse_unused(config: EnvConfig, base: type[EnvConfig]) -> None:
     """Refuses options that LeRobot's own env has and a scenario settles by itself.
 
     Args:
         config: what was parsed.
         base: LeRobot's own dataclass.
-        names: of its options.
 
     Raises:
         OptionError: one of them was given.
     """
     defaults = {f.name: f.default for f in fields(base)}
-    for name in names:
-        if getattr(config, name) != defaults[name]:
+    for name in SETTLED:
+        if name in defaults and getattr(config, name) != defaults[name]:
             raise OptionError(
                 f"--env.{name}={getattr(config, name)}: the scenario decides this. "
                 "Choose scenarios with --env.select"

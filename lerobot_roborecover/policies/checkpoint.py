@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.utils.text import nearest
 
 CONFIG_FILE = "config.json"
 _STEP_FOLDER = "pretrained_model"
@@ -18,7 +19,7 @@ _MAX_HEADER_BYTES = 10**8
 """Of the safetensors format."""
 
 
-def check_checkpoint(path: str | Path, label: str = "", revision: str | None = None) -> None:
+def check_checkpoint(path: str | Path, label: str = "", revision: str | None = None) -> dict[str, Any]:
     """Checks that a policy's checkpoint is there, says what it is, and that its files are whole.
 
     Args:
@@ -26,25 +27,39 @@ def check_checkpoint(path: str | Path, label: str = "", revision: str | None = N
         label: names it in messages; by default the option that names a policy.
         revision: of a Hub id.
 
+    Returns:
+        The checkpoint's configuration.
+
     Raises:
         OptionError: it cannot be loaded.
     """
     folder, label = Path(path), label or f"--policy.path={path}"
     if folder.is_dir():
-        check_folder(folder, label)
-    elif folder.exists():
+        return check_folder(folder, label)
+    if folder.exists():
         raise OptionError(f"{label}: is a file. Name the folder that holds it")
-    else:
-        read_config(_hub_config(str(path), label, revision), label)
+    return read_config(_hub_config(str(path), label, revision), label)
 
 
-def check_folder(folder: Path, label: str) -> None:
+def check_folder(folder: Path, label: str) -> dict[str, Any]:
     """Checks a checkpoint's folder: see `check_checkpoint`."""
     if not (folder / CONFIG_FILE).is_file():
         raise OptionError(f"{label}: the folder has no {CONFIG_FILE}. {_instead_of(folder)}")
-    read_config(folder / CONFIG_FILE, label)
+    config = read_config(folder / CONFIG_FILE, label)
     for file in sorted(p for p in folder.iterdir() if p.suffix in _WEIGHTS and p.is_file()):
         check_file(file, label)
+    return config
+
+
+def nearest_path(path: str | Path) -> str:
+    """Returns the path that is there and most like one that is not; empty where none is."""
+    wanted = Path(path)
+    hub_id = len(wanted.parts) == 2 and not str(path).startswith((".", "/", "~"))
+    for part in (wanted,) if hub_id else (wanted, *wanted.parents):
+        if part.parent.is_dir():
+            near = nearest(part.name, [there.name for there in part.parent.iterdir()])
+            return str(part.parent / near) if near else ""
+    return ""
 
 
 def read_config(file: Path, label: str) -> dict[str, Any]:
@@ -134,6 +149,26 @@ def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths[-3:])) or "another run's: this one has no whole step"
 
 
+def _hub_answers() -> bool:
+    """Returns whether the Hub can be asked; its client tries for half a minute where there is no network."""
+    import socket
+    import urllib.request
+    from urllib.parse import urlsplit
+
+    from huggingface_hub import constants
+
+    if urllib.request.getproxies():
+        return True  # the proxy finds the Hub
+    hub = urlsplit(constants.ENDPOINT)
+    try:
+        with socket.create_connection(
+            (hub.hostname, hub.port or (80 if hub.scheme == "http" else 443)), timeout=5
+        ):
+            return True
+    except OSError:
+        return False
+
+
 def _hub_config(name: str, label: str, revision: str | None) -> Path:
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import (
@@ -145,20 +180,24 @@ def _hub_config(name: str, label: str, revision: str | None) -> Path:
     )
 
     at = "" if revision is None else f" at {revision}"
+    near = nearest_path(name)
+    spelling = f"the nearest is {near}" if near else "check the spelling"
     try:
-        return Path(hf_hub_download(name, CONFIG_FILE, revision=revision))
+        return Path(
+            hf_hub_download(name, CONFIG_FILE, revision=revision, local_files_only=not _hub_answers())
+        )
     except HFValidationError:
         home = "; your shell replaces ~ only at the start of a word" if name.startswith("~") else ""
-        problem = f"there is no such folder. Check the spelling{home}"
+        problem = f"there is no such folder, and it is no Hub id (USER/NAME); {spelling}{home}"
     except LocalEntryNotFoundError:
         problem = (
-            "there is no such folder, and the Hub cannot be reached or HF_HUB_OFFLINE is set. Check the "
-            "spelling and the network"
+            "there is no such folder, and the Hub cannot be reached or HF_HUB_OFFLINE is set; "
+            f"{spelling}, or the network"
         )
     except RepositoryNotFoundError:
         problem = (
-            "neither a folder nor a Hub model that you may read. Check the spelling, and hf auth login for "
-            "a private one"
+            f"neither a folder nor a Hub model that you may read; {spelling}, and hf auth login for a "
+            "private one"
         )
     except EntryNotFoundError:
         problem = f"the Hub model has no {CONFIG_FILE}{at}: it is no LeRobot policy. Name another"

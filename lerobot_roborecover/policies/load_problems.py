@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 from lerobot.configs import PreTrainedConfig
@@ -11,8 +11,18 @@ from lerobot.utils.constants import ACTION
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 
 
-def load_remedy(err: Exception) -> str:
-    """What to do about an error that loading raised; empty where its own message is the best there is."""
+def error_words(err: Exception) -> str:
+    """An error's message as one line, without LeRobot's general advice on mismatched features."""
+    return " ".join(str(err).partition("Please ensure your dataset and policy")[0].split())
+
+
+def load_remedy(err: Exception, inputs: str = "") -> str:
+    """What to do about an error that loading raised; empty where its own message is the best there is.
+
+    Args:
+        err: what was raised.
+        inputs: what gives the inputs that the environment lacks, where that is known.
+    """
     text, kind = str(err).lower(), {c.__name__ for c in type(err).__mro__}
     if "error(s) in loading state_dict" in text:
         return "config.json and the weights are of different policies, or of another LeRobot: copy both again"
@@ -25,10 +35,7 @@ def load_remedy(err: Exception) -> str:
             "lerobot.processor.migrate_policy_normalization --pretrained-path CHECKPOINT"
         )
     if "feature" in text and "mismatch" in text:
-        return (
-            "the checkpoint's cameras have other names than the env's: give --rename_map, or it is for "
-            "another robot"
-        )
+        return inputs or "the checkpoint's cameras are not the environment's: take another checkpoint"
     if "SafetensorError" in kind:
         return "its weights are damaged: copy or download the checkpoint again"
     if kind & {"HfHubHTTPError", "LocalEntryNotFoundError", "HFValidationError"} or "huggingface hub" in text:
@@ -43,11 +50,12 @@ def load_remedy(err: Exception) -> str:
 
 
 @contextmanager
-def plain_loading(label: str) -> Generator[None]:
+def plain_loading(label: str, inputs: Callable[[], str] = str) -> Generator[None]:
     """Raises what loading a checkpoint fails with as one line, wherever there is a remedy to say.
 
     Args:
         label: names the checkpoint.
+        inputs: says what gives the inputs that the environment lacks.
 
     Raises:
         OptionError: in the words of the error, with the remedy.
@@ -57,10 +65,11 @@ def plain_loading(label: str) -> Generator[None]:
     except RoboRecoverError:
         raise
     except Exception as err:  # policies, and what they import, raise types of their own
-        remedy = load_remedy(err)
+        remedy = load_remedy(err, inputs())
         if not remedy:
             raise
-        raise OptionError(f"{label}: {' '.join(str(err).split()):.300}. What to do: {remedy}") from err
+        words = error_words(err).removesuffix(".")
+        raise OptionError(f"{label}: {words:.300}. What to do: {remedy}") from err
 
 
 def other_action_width(config: PreTrainedConfig, width: int) -> int | None:

@@ -44,6 +44,7 @@ class OptionSpec:
     show_default: bool = True
     internal: bool = False
     asked: bool = True
+    checkpoint: bool = False
 
 
 def option(
@@ -74,7 +75,9 @@ def option(
             group: heading in the help of a nested dataclass's options;
             show_default: whether the default is shown: in the help and in the table of options;
             internal: no option at all;
-            asked: False where the command line may lack a required option.
+            asked: False where the command line may lack a required option;
+            checkpoint: names a policy's checkpoint, `[NAME=]CHECKPOINT`, which is checked before the command
+                imports LeRobot.
     """
     made = OptionSpec(parse=parse, text=text, **spec)
     if factory is not MISSING:
@@ -234,6 +237,23 @@ def _value(one: Option, value: Any) -> Any:
     if one.repeated or one.count:
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     return one.kind(value) if isinstance(one.kind, type) and issubclass(one.kind, Enum) else value
+
+
+def checkpoints_of(options: Any) -> list[tuple[str, str]]:
+    """Returns the (name, text) of each option of a command that names a policy's checkpoint.
+
+    Args:
+        options: the command's dataclass.
+    """
+    found = []
+    for field in dataclasses.fields(options):
+        spec, value = field.metadata.get(_KEY, OptionSpec()), getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            found += checkpoints_of(value)
+        elif spec.checkpoint and value:
+            name = spec.name or _name(field.name, None)
+            found += [(name, str(text)) for text in (value if isinstance(value, tuple) else (value,))]
+    return found
 
 
 def field_docs(kind: type) -> dict[str, str]:

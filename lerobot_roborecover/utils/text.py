@@ -53,6 +53,13 @@ def align(rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> lis
     ]
 
 
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Returns the name that is most like a word; empty where none is."""
+    from difflib import get_close_matches
+
+    return next(iter(get_close_matches(word, list(known), 1)), "")
+
+
 def format_duration(seconds: float) -> str:
     """A duration as `h:mm:ss`."""
     whole = round(seconds)

@@ -262,6 +262,62 @@ def test_a_checkpoint_for_another_robot(run, tmp_path, command):
     assert "another robot" in text
 
 
+def picture_inputs(*cameras: str) -> dict:
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    pictures = {f"observation.{c}": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)) for c in cameras}
+    return {"observation.state": PolicyFeature(FeatureType.STATE, (8,)), **pictures}
+
+
+@pytest.mark.parametrize(
+    ("platform", "options", "cameras", "observed", "said"),
+    [
+        ("fake", {}, ["image"], None, "give --env.obs_type=pixels_agent_pos"),
+        (
+            "libero", {"camera_name": "agentview_image"}, ["images.image", "images.image2"],
+            ["observation.state", "observation.images.image"],
+            "give --env.camera_name=agentview_image,robot0_eye_in_hand_image",
+        ),
+        (
+            "libero", {}, ["images.front", "images.image2"], None,
+            'give --rename_map=\'{"observation.images.image": "observation.images.front"}\'; else take a '
+            "checkpoint that was trained on observation.images.image, observation.images.image2",
+        ),
+        (
+            "metaworld", {}, ["image", "images.wrist"], None,
+            "no option of roborecover_metaworld gives observation.images.wrist: take a checkpoint whose "
+            "inputs are among what it gives (observation.image, observation.state)",
+        ),
+        ("robotwin", {}, ["images.mosaic"], None, "give --env.mosaic=true"),
+        (
+            "robotwin", {"camera_names": "head_camera"}, ["images.head_camera", "images.left_camera"], None,
+            "give --env.camera_names=head_camera,left_camera,right_camera",
+        ),
+        ("libero", {"obs_type": "state"}, ["images.empty_camera_0"], None, ""),
+    ],
+)  # fmt: skip
+def test_what_gives_a_camera_that_is_missing(platform, options, cameras, observed, said):
+    """An option of the environment where one does; a map only where a camera of another name is spare."""
+    from lerobot_roborecover.evaluation.env_configs import env_type
+    from lerobot_roborecover.evaluation.missing_inputs import input_remedy
+
+    found = input_remedy(env_type(platform)(**options), picture_inputs(*cameras), {}, observed)
+    assert found.endswith(said) if said else not found
+    assert ("--rename_map" in found) == ("--rename_map" in said)
+
+
+@pytest.mark.parametrize("command", ["check-policy", "eval"])
+def test_a_camera_that_the_environment_lacks(run, tmp_path, command):
+    """LeRobot's own words on such a mismatch propose a rename map."""
+    images = ("observation.images.front", "observation.images.wrist")
+    policy = save_policy(tmp_path / "act", "act", images=images)
+    status, out, errors = run(command, policy, "--env.obs_type=pixels_agent_pos")
+    text = " ".join((out if command == "check-policy" else errors).split())
+    assert status == (1 if command == "check-policy" else 2), text
+    assert "no option of roborecover_fake gives observation.images.front, observation.images.wrist" in text
+    assert "rename_map" not in text
+
+
 def test_a_state_of_another_width(run, tmp_path):
     policy = save_policy(tmp_path / "act", "act", state=9)
     status, out, _ = run("check-policy", policy, "--json")

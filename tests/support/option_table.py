@@ -44,10 +44,11 @@ def _parsers_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentP
 
 def lerobots_options() -> dict[str, Options]:
     """By command, or by what is chosen: options of ours that LeRobot's parser reads, not LeRobot's own."""
-    from lerobot_roborecover.evaluation.check_policy import SHORT, CheckOptions
+    from lerobot_roborecover.evaluation.check_policy import CheckOptions
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
     from lerobot_roborecover.evaluation.options import RecoveryOptions
-    from lerobot_roborecover.evaluation.runner import ALIASES, RunnerOptions
+    from lerobot_roborecover.evaluation.runner import RunnerOptions
+    from lerobot_roborecover.evaluation.short_names import ALIASES, JSON
     from lerobot_roborecover.platforms.registry import ENV_PREFIX
     from lerobot_roborecover.policies import ema
     from lerobot_roborecover.policies.detectors.monitor import (
@@ -62,7 +63,7 @@ def lerobots_options() -> dict[str, Options]:
     from lerobot_roborecover.robot.commands import CaptureConfig, PlanRunConfig, RestoreConfig
 
     short = {f"--{name}": {"stands_for": f"--{long}"} for name, long in ALIASES.items()}
-    check = {name: {"stands_for": long} for name, long in SHORT.items()}
+    check = {f"--{name}": {"stands_for": f"--{long}"} for name, long in JSON.items()}
     return {
         "eval": _of_class(RunnerOptions, "--runner.") | _of_class(RecoveryOptions, "--env.") | short,
         "check policy": _of_class(CheckOptions, "--check.") | check,

@@ -47,7 +47,7 @@ class ForkRequest:
 
     logs: Sequence[Path] = option(positional=True)
     """Trial logs of runs with --env.record_actions=true."""
-    policy: str = option()
+    policy: str = option(checkpoint=True)
     """Checkpoint that ran the trials: folder or Hub id."""
     out: Path = option()
     """Folder of the forks' log and page; a rerun goes on there."""

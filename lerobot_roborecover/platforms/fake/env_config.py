@@ -17,6 +17,7 @@ class FakeConfig(StateEnvConfig):
     state_widths = {"agent_pos": 4, "environment_state": 6}  # noqa: RUF012 - declared as ClassVar
 
     observation_size: int = 32
+    """Side of the picture, pixels."""
     step_s: float = 0.0
     """Wall time of a step, seconds."""
 

@@ -23,6 +23,7 @@ class FakePlatform(Platform):
     action_widths = (2,)
     control_hz = 20.0
     settle_steps = 2
+    env_config_class = "lerobot_roborecover.platforms.fake.env_config:FakeConfig"
     simulator = "lerobot_roborecover.platforms.fake.simulator:FakeSimulator"
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
@@ -48,12 +49,6 @@ class FakePlatform(Platform):
     def controls(self) -> Controls:
         """Two directions."""
         return Controls("fake", 2, {"forward": (1, 1.0), "left": (0, -1.0)})
-
-    def env_config(self) -> type:
-        """A configuration of its own."""
-        from lerobot_roborecover.platforms.fake.env_config import FakeConfig
-
-        return FakeConfig
 
 
 def _pusher(lag: float, about: str) -> Expert:

@@ -28,6 +28,7 @@ class LeRobotPlatform(Platform):
     simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
     extra = "gym"
     env_name = FAMILY_NAME
+    env_config_class = "lerobot_roborecover.platforms.lerobot.env_config:LeRobotConfig"
     env_type: ClassVar[str]
     """LeRobot's name; of a type that is not known, as the platform's name has it until LeRobot is asked."""
 
@@ -110,9 +111,6 @@ class LeRobotPlatform(Platform):
         same = observation.get("observation.state", ())[-1:] == (known.state_width,)
         return same and environment[-1:] == (known.environment_width,)
 
-    def env_config(self) -> type:
-        return FAMILY.env_config()
-
 
 _SEEN = (
     "obs_type",
@@ -130,6 +128,7 @@ class LeRobotEnvPlatform(Platform):
     control_hz = 10.0
     extra = "gym"
     simulator = "lerobot_roborecover.platforms.lerobot.simulator:LeRobotSimulator"
+    env_config_class = "lerobot_roborecover.platforms.lerobot.env_config:LeRobotConfig"
     default_scenarios = "pusht_starter"
 
     def resolve(self, options: Sequence[str]) -> Platform:
@@ -146,12 +145,6 @@ class LeRobotEnvPlatform(Platform):
 
     def make_simulator(self, **options: Any) -> Simulator:
         return member(member_name(DEFAULT_TYPE)).make_simulator(**options)
-
-    def env_config(self) -> type:
-        """LeRobot's own config of the base type, inside one of ours."""
-        from lerobot_roborecover.platforms.lerobot.env_config import LeRobotConfig
-
-        return LeRobotConfig
 
 
 FAMILY = LeRobotEnvPlatform()

@@ -78,11 +78,7 @@ class LiberoConfig(LiberoEnv, VideoEnvMixin):
         """
         from lerobot_roborecover.platforms.libero.assets import find_assets, physics_hash
 
-        refuse_unused(
-            self,
-            LiberoEnv,
-            ("task", "task_ids", "init_states", "hard_reset", "is_libero_plus", "episode_length"),
-        )
+        refuse_unused(self, LiberoEnv)
         check_quality(self.render_quality)
         if self.fps != 20:
             raise OptionError(f"--env.fps={self.fps}: recorded prefixes are of 20 Hz")

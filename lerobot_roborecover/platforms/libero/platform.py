@@ -44,8 +44,13 @@ class LiberoPlatform(Platform):
     }
     extra = "libero"
     simulator = "lerobot_roborecover.platforms.libero.simulator:LiberoSimulator"
+    env_config_class = "lerobot_roborecover.platforms.libero.env_config:LiberoConfig"
     default_scenarios = "libero_recovery"
     default_split = "test"
+    observation_options = (
+        *Platform.observation_options,
+        ("camera_name", "agentview_image,robot0_eye_in_hand_image"),
+    )
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
         """By suite, in hf-libero's order."""
@@ -108,12 +113,6 @@ class LiberoPlatform(Platform):
             },
             live_options={"render_quality": "fast"},
         )  # fmt: skip
-
-    def env_config(self) -> type:
-        """LeRobot's `LiberoEnv`, and where assets are."""
-        from lerobot_roborecover.platforms.libero.env_config import LiberoConfig
-
-        return LiberoConfig
 
     def examine(self, required: bool, recorded: Mapping[str, str]) -> list[Check]:
         """Meshes and textures; nothing is downloaded here."""

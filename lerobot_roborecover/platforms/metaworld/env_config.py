@@ -66,7 +66,7 @@ class MetaworldConfig(MetaworldEnv, VideoEnvMixin):
         Raises:
             OptionError: one cannot be used.
         """
-        refuse_unused(self, MetaworldEnv, ("task", "episode_length", "multitask_eval"))
+        refuse_unused(self, MetaworldEnv)
         check_quality(self.render_quality)
         picture = first_camera
         if self.obs_type == "state":

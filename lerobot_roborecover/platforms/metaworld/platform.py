@@ -26,6 +26,7 @@ class MetaworldPlatform(Platform):
     action_names = {4: ("right", "forward", "up", "gripper")}
     required_versions = {"lerobot": ("0.6.1",), "mujoco": ("3.3.2",), "metaworld": ("3.0.0",)}
     simulator = "lerobot_roborecover.platforms.metaworld.simulator:MetaworldSimulator"
+    env_config_class = "lerobot_roborecover.platforms.metaworld.env_config:MetaworldConfig"
     default_scenarios = "metaworld_starter"
 
     def tasks(self, options: Mapping[str, Any] | None = None) -> Sequence[Task]:
@@ -49,12 +50,6 @@ class MetaworldPlatform(Platform):
             captions={"observation.image": "W goes to the right, A to the back"},
             live_options={"render_quality": "fast"},
         )  # fmt: skip
-
-    def env_config(self) -> type:
-        """LeRobot's `MetaworldEnv`, with state alone and fast pictures beside."""
-        from lerobot_roborecover.platforms.metaworld.env_config import MetaworldConfig
-
-        return MetaworldConfig
 
 
 @cache

@@ -93,7 +93,7 @@ class RobotwinConfig(RoboTwinEnvConfig, VideoEnvMixin):
         from lerobot_roborecover.platforms.robotwin.simulator import CAMERA_NAMES
         from lerobot_roborecover.platforms.robotwin.stubs import has_curobo
 
-        refuse_unused(self, RoboTwinEnvConfig, ("task", "episode_length"))
+        refuse_unused(self, RoboTwinEnvConfig)
         if self.render_quality not in QUALITIES:
             raise OptionError(
                 f"--env.render_quality={self.render_quality}: not one of {', '.join(QUALITIES)}"

@@ -43,7 +43,13 @@ class RobotwinPlatform(Platform):
     required_versions = {"lerobot": ("0.6.1",), "sapien": ("3.0.3",), "toppra": ("0.6.10",)}
     extra = "robotwin"
     simulator = "lerobot_roborecover.platforms.robotwin.simulator:RobotwinSimulator"
+    env_config_class = "lerobot_roborecover.platforms.robotwin.env_config:RobotwinConfig"
     default_scenarios = "robotwin_starter"
+    observation_options = (
+        *Platform.observation_options,
+        ("camera_names", "head_camera,left_camera,right_camera"),
+        ("mosaic", True),
+    )
     perturbable = False
     why_not_perturbable = (
         "RoboTwin's actions are joint targets, or absolute poses that a planner turns "
@@ -108,12 +114,6 @@ class RobotwinPlatform(Platform):
             "through a motion planner, and takes 50 to 750 physics steps, so that there is no small motion "
             "that a key could stand for. Take rollouts of policies or of its scripted expert instead"
         )
-
-    def env_config(self) -> type:
-        """LeRobot's `RoboTwinEnvConfig`, with the checkout, picture qualities and action modes."""
-        from lerobot_roborecover.platforms.robotwin.env_config import RobotwinConfig
-
-        return RobotwinConfig
 
     def examine(self, required: bool, recorded: Mapping[str, str]) -> list[Check]:
         """Checkout, robot, objects, Vulkan and planners."""

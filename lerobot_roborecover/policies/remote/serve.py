@@ -35,6 +35,7 @@ class ServeConfig:
     host: str = "127.0.0.1"
     """Address to listen on. Beyond the loopback, ROBORECOVER_API_KEY must be set, here and at the client."""
     port: int = 8000
+    """To listen on; 0 takes a free one."""
     max_batch: int = 64
     """Requests inferred together, at most."""
     batch_delay_ms: float = 5.0
