@@ -2,10 +2,10 @@
 
 import logging
 
-from lerobot_roborecover.platforms.versions import lerobot_note
+from lerobot_roborecover.utils.lerobot_versions import installed_problem
 
 # Before the rest: where LeRobot has changed too much, LeRobot itself only says that importing this failed.
-if note := lerobot_note():
+if note := installed_problem():
     logging.getLogger(__name__).warning(note)
 
 import lerobot_roborecover.plugin

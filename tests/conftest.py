@@ -7,7 +7,6 @@ import logging
 import os
 import sys
 from collections import Counter
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -46,15 +45,6 @@ def logging_forgets_streams():
         if type(handler) in (logging.StreamHandler, logging.FileHandler) and handler not in before:
             root.removeHandler(handler)
             handler.close()
-
-
-@pytest.fixture(autouse=True)
-def scores_of_another_lerobot(monkeypatch):
-    """Scores of another LeRobot than the known one are refused; what comes after that is tested, too."""
-    from tests.support import known_lerobot
-
-    if known_lerobot.installed_is_another():
-        monkeypatch.setattr(metadata, "version", known_lerobot.version)
 
 
 @pytest.fixture

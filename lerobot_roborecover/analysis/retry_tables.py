@@ -17,6 +17,7 @@ from lerobot_roborecover.analysis.stats.retries import (
     rates_for_steps,
     rates_within,
 )
+from lerobot_roborecover.analysis.stats.soundness import valid_trials
 from lerobot_roborecover.analysis.tables import Column, Table
 
 BUDGETS = (0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
@@ -32,14 +33,15 @@ class Retried:
 
 
 def retried(results: Results) -> list[Retried]:
-    """Every policy, best first, then every intervention; empty where no scenario has two trials of one."""
+    """Every policy with a valid trial, best first, then every intervention; empty where no scenario has two
+    trials of one."""
     of = {arm.title: arm for arm in results.study.arms}
     panels = [results.recovery, *([] if results.interventions is None else [results.interventions])]
     found: dict[str, Retried] = {}
     for panel in panels:
-        draws = results.resample(panel)
+        draws, valid = results.resample(panel), valid_trials(panel)
         for p, title in enumerate(panel.arms):
-            if title not in found:
+            if title not in found and valid[p]:
                 attempts = attempts_of(of[title], panel, p, results.options.scheduled)
                 found[title] = Retried(attempts, draws)
     every = list(found.values())

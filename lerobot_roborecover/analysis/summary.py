@@ -84,6 +84,11 @@ class StartSummary:
         """Whether any trial was valid: invalid trials alone say nothing about the policy."""
         return sum(self.invalid.values()) < self.trials
 
+    @property
+    def rate(self) -> Estimate:
+        """`rsr`, undefined where no trial was valid."""
+        return self.rsr if self.measured else UNDEFINED
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -195,7 +200,7 @@ def format_table(summary: Summary) -> str:
         if part is None:
             continue
         counts = f"{part.scenarios:>10}{part.trials:>8}{sum(part.invalid.values()):>9}"
-        lines.append(f"{title:<26}{_rate(part.rsr if part.measured else UNDEFINED)}{counts}")
+        lines.append(f"{title:<26}{_rate(part.rate)}{counts}")
         if not part.measured:
             continue
         lines += [f"{f'  within {k} attempts':<26}{_rate(found)}" for k, found in part.within.items()]

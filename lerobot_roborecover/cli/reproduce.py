@@ -49,8 +49,7 @@ OPTIONS = ReproduceOptions
 
 def run(options: ReproduceOptions) -> int:
     """Runs both arms and writes the report; exit status 1 where the initial arm is below what is
-    published."""
-    from lerobot_roborecover.analysis.stats.agreement import AgreementVerdict
+    published, or was not measured."""
     from lerobot_roborecover.reproduce import (
         ReproductionPlan,
         find_checkpoint,
@@ -58,7 +57,7 @@ def run(options: ReproduceOptions) -> int:
         run_arms,
         write_record,
     )
-    from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, published_score
+    from lerobot_roborecover.reproduce.arms import INITIAL, RECOVERY, STOPS, published_score
     from lerobot_roborecover.reproduce.record import check_record, verdict
 
     if options.name is None:
@@ -89,4 +88,4 @@ def run(options: ReproduceOptions) -> int:
     result = run_arms(plan, say=lambda line: print(line, flush=True))
     page, _ = write_record(result)
     print(f"\n{verdict(result)}\nreport {page}", file=sys.stdout)
-    return 1 if result.check.standing is AgreementVerdict.LOWER else 0
+    return int(result.check.standing in STOPS)

@@ -10,6 +10,7 @@ from typing import Any
 
 from lerobot_roborecover.platforms import versions
 from lerobot_roborecover.platforms.findings import Check, Status
+from lerobot_roborecover.utils.lerobot_versions import TESTED, version_problem
 
 DISTRIBUTION = "lerobot_env_roborecover"
 MINIMUM_PYTHON = (3, 12)
@@ -38,11 +39,11 @@ def check_versions(platform_name: str, required: bool) -> list[Check]:
             status = Status.FAILURE if required else Status.WARNING
             remedy = versions.install_command(platform_name)
             checks.append(Check(name, status, f"not installed; {wanted} is required", remedy))
+        elif distribution in versions.STAMPS and not version_problem(found):
+            detail = f"{found}, which is written to every row; tests were run with {' and '.join(TESTED)}"
+            checks.append(Check(name, Status.OK, detail))
         elif found in accepted:
             checks.append(Check(name, Status.OK, found))
-        elif distribution in versions.STAMPS and not versions.stamp_problem(found):
-            detail = f"{found}, which is written to every row; RoboRecover is tested with {wanted}"
-            checks.append(Check(name, Status.OK, detail))
         else:
             detail = f"{found}; comparable scores require {wanted}"
             checks.append(Check(name, Status.FAILURE, detail, f"pip install '{distribution}=={accepted[0]}'"))

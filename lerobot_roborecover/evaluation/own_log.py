@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.platforms.versions import installed, required
+from lerobot_roborecover.platforms.versions import row_versions
 from lerobot_roborecover.policies.identity import content_hash, policy_identity
 from lerobot_roborecover.utils.atomic_io import atomic_write
 
@@ -25,7 +25,7 @@ def identity_of_run(platform: str, policy: Mapping[str, Any], **others: Any) -> 
             takes the place of its path.
         others: whatever else decides the run's results, JSON-able.
     """
-    versions = {name: installed(name) or "" for name in required(platform)} if platform else {}
+    versions = row_versions(platform) if platform else {}
     return json.loads(
         json.dumps({"policy": _by_content(policy), "versions": versions, **others}, default=str)
     )

@@ -30,7 +30,7 @@ from lerobot_roborecover.platforms.robot_fingerprint import (
     compare_robots,
     is_robot_entry,
 )
-from lerobot_roborecover.platforms.versions import STAMPS, installed, required, version_problems
+from lerobot_roborecover.platforms.versions import STAMPS, installed, row_versions, version_problems
 from lerobot_roborecover.policies.interventions.options import InterventionFacts
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Scenario, Start, TrialStart
@@ -214,7 +214,7 @@ def create_session(
         execution_horizon=facts.execution_horizon,
         policy_settings=facts.policy_settings,
         options=decisive,
-        versions={name: installed(name) or "" for name in required(platform)},
+        versions=row_versions(platform),
     )
     log = TrialLog(options.trial_log_path(facts.output_dir))
     trials = "" if facts.n_episodes is None else f", {facts.n_episodes} trials each"

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import metadata
 
-from packaging.version import Version
-
 from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.utils.lerobot_versions import version_problem
 
-LEROBOT = "0.6.1"
-"""The oldest LeRobot that this package runs with, and the one that its tests run with (`constraints.txt`)."""
 STAMPS = ("lerobot",)
-"""Distributions whose version is in every row that a platform writes, and is told apart, but not refused:
-LeRobot brings policies and observations, and physics is in the pinned packages."""
+"""Distributions whose version is in every row, and is told apart, but not refused: LeRobot brings policies
+and observations, and physics is in the pinned packages."""
 
 
 def installed(distribution: str) -> str | None:
@@ -27,6 +24,11 @@ def installed(distribution: str) -> str | None:
 def required(platform: str) -> Mapping[str, tuple[str, ...]]:
     """Distribution names and the versions whose scores can be compared with published ones."""
     return platform_named(platform).required_versions
+
+
+def row_versions(platform: str) -> dict[str, str]:
+    """Returns what a row of the platform says of versions: those on which scores depend, and the stamps."""
+    return {name: installed(name) or "" for name in (*required(platform), *STAMPS)}
 
 
 def install_command(platform: str) -> str:
@@ -50,7 +52,7 @@ def version_problems(platform: str) -> list[str]:
                 f"{install_command(platform)}"
             )
         elif distribution in STAMPS:
-            if note := stamp_problem(found):
+            if note := version_problem(found):
                 problems.append(note)
         elif found not in versions:
             problems.append(
@@ -58,18 +60,3 @@ def version_problems(platform: str) -> list[str]:
                 f"pip install '{distribution}=={versions[0]}'"
             )
     return problems
-
-
-def stamp_problem(found: str) -> str | None:
-    """What is wrong with an installed LeRobot, with the remedy; None from the oldest one on."""
-    if Version(found) >= Version(LEROBOT):
-        return None
-    return f"lerobot is {found}; RoboRecover runs with {LEROBOT} or newer: pip install 'lerobot>={LEROBOT}'"
-
-
-def lerobot_note() -> str | None:
-    """One line on the LeRobot that is installed, with what to do; None where it can be used."""
-    found = installed("lerobot")
-    if found is None:
-        return f"LeRobot is not installed as a package: pip install 'lerobot>={LEROBOT}'"
-    return stamp_problem(found)

@@ -7,22 +7,22 @@ optimizer's state with each checkpoint and loads it on `--resume`, and the shado
 export-ema` turns it into a plain checkpoint.
 
 LeRobot averages by itself from huggingface/lerobot#4323 on. There this optimizer is not needed any more; it
-works as before, so that one training configuration does for both, and names the options to use instead. To
-be removed, with `export_ema`, once the oldest LeRobot that we run with has `--ema.enable`.
+works as before, so that one training configuration does for both, and names the options to use instead. It
+goes with the oldest LeRobot (`utils/lerobot_versions.py`, `REPLACED`).
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, overload
 
 import torch
-from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.utils.lerobot_versions import averages_weights
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class EmaAdamWConfig(AdamWConfig):
         """
         if not 0.0 <= self.ema_decay < 1.0:
             raise OptionError(f"--optimizer.ema_decay={self.ema_decay}: at least 0, and below 1")
-        if any(f.name == "ema" for f in fields(TrainPipelineConfig)):
+        if averages_weights():
             logger.warning(
                 "roborecover_ema_adamw is not needed on this LeRobot, which averages weights by itself: with "
                 "'type: adamw' in place of 'type' and 'ema_decay' under 'optimizer', --ema.enable=true "

@@ -137,6 +137,10 @@ class ReproductionPlan:
         return run_length(list(scenarios), self.trials, executed, self.costs, replay=start == RECOVERY)
 
 
+STOPS = (AgreementVerdict.LOWER, AgreementVerdict.UNMEASURED)
+"""Standings of the initial arm after which the recovery arm is not run."""
+
+
 @dataclass(frozen=True)
 class ArmResult:
     """An arm that has been run."""
@@ -159,7 +163,7 @@ class ReproductionResult:
     """The initial arm beside the published score."""
     makers: tuple[PublishedScore, ScoreAgreement] | None
     recovery: ArmResult | None
-    """None where the initial arm is below what is published."""
+    """None where the initial arm is below what is published, or was not measured."""
     against_paper: ScoreAgreement | None
     """The recovery arm beside the paper's."""
 
@@ -181,16 +185,16 @@ def run_arms(plan: ReproductionPlan, say: Callable[[str], None] = print) -> Repr
     """
     scenarios = plan.scenarios()
     initial = _run(plan, INITIAL, scenarios, say)
-    rate = initial.summary.rsr
+    rate = initial.summary.rate
     check = agreement(rate, plan.published.rate if plan.published else None, plan.margin)
     makers = plan.checkpoint.of_makers(list(scenarios))
     beside = None if makers is None else (makers, agreement(rate, makers.rate, plan.margin))
     recovery = None
-    if check.standing is not AgreementVerdict.LOWER or plan.anyway:
+    if check.standing not in STOPS or plan.anyway:
         recovery = _run(plan, RECOVERY, scenarios, say)
     against = None
     if recovery is not None:
-        against = agreement(recovery.summary.rsr, plan.checkpoint.recovery, plan.margin)
+        against = agreement(recovery.summary.rate, plan.checkpoint.recovery, plan.margin)
     return ReproductionResult(plan, len(scenarios), initial, check, beside, recovery, against)
 
 

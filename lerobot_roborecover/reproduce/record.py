@@ -60,6 +60,13 @@ def verdict(result: ReproductionResult) -> str:
     check, margin = result.check, 100 * result.plan.margin
     ours, theirs = (_percent(e) for e in (check.measured, check.published))
     gap = f"{_percent(check.difference, sign=True)} points"
+    if check.standing is AgreementVerdict.UNMEASURED:
+        why = ", ".join(f"{count} {outcome}" for outcome, count in result.initial.summary.invalid.items())
+        return (
+            f"**Not measured.** Every trial from initial states was invalid ({why}), so there is no rate to "
+            "hold against what is published. Find the cause first: roborecover check policy, and the reasons "
+            "in the trial log."
+        )
     if check.standing is AgreementVerdict.UNPUBLISHED:
         return (
             f"**Not confirmed.** Initial states {ours} %. No score is published to hold this against, so "
@@ -147,7 +154,14 @@ def _scores(result: ReproductionResult) -> Table:
     for name, arm in (("initial states", result.initial), ("recovery (RSR)", result.recovery)):
         if arm is not None and name not in told:
             rows.append(
-                (name, arm.summary.rsr, None, None, str(AgreementVerdict.UNPUBLISHED), "nothing is published")
+                (
+                    name,
+                    arm.summary.rate,
+                    None,
+                    None,
+                    str(AgreementVerdict.UNPUBLISHED),
+                    "nothing is published",
+                )
             )
     return Table(
         "scores", "Scores",
@@ -177,7 +191,7 @@ def _work(result: ReproductionResult) -> Table:
 
 def _arm(result: ReproductionResult, arm: ArmResult) -> dict[str, Any]:
     return {
-        "rate": asdict(arm.summary.rsr),
+        "rate": asdict(arm.summary.rate),
         "trials": arm.summary.trials,
         "invalid": {str(k): v for k, v in arm.summary.invalid.items()},
         "seconds": arm.seconds,

@@ -141,6 +141,13 @@ def test_what_has_no_retries_says_nothing_of_them(tmp_path):
     assert not any(math.isnan(e.value) for row in within.rows for e in row[1:])
 
 
+def test_a_policy_with_invalid_trials_alone_has_no_row(tmp_path):
+    rows = policy_rows("alpha@1", 8, 3, 0.5, 0)
+    broken = [replace(row, outcome="sim_error", success=False) for row in policy_rows("beta@2", 8, 3, 0.5, 1)]
+    for table in retry_tables(results_of(tmp_path, rows, broken)):
+        assert [row[0] for row in table.rows] == ["alpha@1"]
+
+
 def test_interventions_have_a_row_and_runs_are_no_retries(tmp_path):
     """A method of two runs of one trial each has no second attempt: another training is no retry."""
     base = policy_rows("base@1", 8, 3, 0.5, 0)

@@ -38,11 +38,13 @@ def test_the_interval_of_the_difference_is_newcombes():
         ((0.70, 0.60, 0.78), AgreementVerdict.LOWER),
         ((0.99, 0.985, 1.0), AgreementVerdict.HIGHER),
         ((0.0, math.nan, math.nan), AgreementVerdict.UNPUBLISHED),
+        ((math.nan, math.nan, math.nan), AgreementVerdict.UNMEASURED),
     ],
 )
 def test_what_may_be_said(measured, standing):
     assert agreement(Estimate(*measured), Estimate(0.9417, 0.915, 0.965)).standing is standing
-    assert agreement(Estimate(*measured), None).standing is AgreementVerdict.UNPUBLISHED
+    unpublished = AgreementVerdict.UNPUBLISHED if standing is not AgreementVerdict.UNMEASURED else standing
+    assert agreement(Estimate(*measured), None).standing is unpublished
 
 
 def test_a_published_rate_without_interval_is_taken_as_exact():

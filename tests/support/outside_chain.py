@@ -17,7 +17,6 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import save_policy
-from tests.support.known_lerobot import count_as_known
 
 STEP = 30
 TRIALS = 1
@@ -110,5 +109,4 @@ def run(root: Path, chain: Pipeline) -> dict:
 
 
 if __name__ == "__main__":
-    count_as_known()
     print(json.dumps(run(Path(sys.argv[1]), CHAINS[sys.argv[2]])))

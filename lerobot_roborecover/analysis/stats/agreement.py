@@ -26,6 +26,8 @@ class AgreementVerdict(StrEnum):
     LOWER = "lower"
     HIGHER = "higher"
     UNPUBLISHED = "unpublished"
+    UNMEASURED = "unmeasured"
+    """No trial was valid, so that there is no rate."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,13 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
     2012), whatever these were made by.
 
     Args:
-        measured: here.
+        measured: here; undefined where no trial was valid.
         published: by others; None where there is nothing.
         margin: in (0, 1), the loss that must not be able to hide.
     """
     nothing = Estimate(math.nan, math.nan, math.nan)
+    if math.isnan(measured.value):
+        return ScoreAgreement(measured, published or nothing, nothing, AgreementVerdict.UNMEASURED)
     if published is None or math.isnan(measured.low):
         return ScoreAgreement(measured, published or nothing, nothing, AgreementVerdict.UNPUBLISHED)
     low, high = (_or(bound, published.value) for bound in (published.low, published.high))

@@ -46,8 +46,8 @@ class RoboRecoverMonitorConfig(RewardModelConfig):
     """Linear layers of the language model that get adapters; the vision encoder stays as it is."""
     micro_batch_size: int = 4
     """Frames in memory at once during training. A batch is worked off in pieces of this size, so that
-    `--batch_size=32` is the paper's 4 frames with gradients accumulated over 8 pieces. To be removed once the
-    oldest LeRobot that we run with accumulates gradients (huggingface/lerobot#4010)."""
+    `--batch_size=32` is the paper's 4 frames with gradients accumulated over 8 pieces. It goes with
+    the oldest LeRobot, which does not accumulate (`utils/lerobot_versions.py`, `REPLACED`)."""
     gradient_checkpointing: bool = True
     """Keep only each layer's input and compute the rest again: less memory for a piece, and another forward
     pass of the language model."""
