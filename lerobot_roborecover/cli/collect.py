@@ -51,7 +51,8 @@ def pass_through(argv: Sequence[str]) -> int:
 
     parser = build_parser()
     args, rest = parser.parse_known_args(pairs(argv))
-    if args.expert != "?":
+    both = args.expert and any(word.startswith("--policy.path=") for word in rest)
+    if args.expert != "?" and not both:  # both are refused with the other options
         CommandLine(LEROBOTS, rest).check()
     if args.expert == "?":
         from lerobot_roborecover.curation.collect.experts import list_experts

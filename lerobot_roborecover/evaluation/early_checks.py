@@ -20,6 +20,7 @@ from lerobot_roborecover.utils.config_source import (
     nested_class,
     read_class,
     registered_classes,
+    registrations,
 )
 from lerobot_roborecover.utils.text import nearest
 
@@ -171,9 +172,13 @@ class CommandLine:
             return
         if kind in types or self._elsewhere():
             return
-        near = nearest(kind, types) or nearest(ENV_PREFIX + kind, types)
-        hint = f"the nearest is {types[near]}" if near else f"there are {there}"
-        raise OptionError(f"--env={kind:.80}: not a recovery env type; {hint}")
+        name = "env.type" if "env.type" in self.given else ENV
+        bare = {one.removeprefix(ENV_PREFIX): documented for one, documented in types.items()}
+        near = nearest(kind.removeprefix(ENV_PREFIX), bare)
+        hint = f"the nearest is {bare[near]}" if near else f"there are {there}"
+        if not near and kind in registrations("lerobot.envs.configs", "EnvConfig"):
+            hint = f"give --env {env_type_of('lerobot')} --env.base.type={kind}"
+        raise OptionError(f"--{name}={kind:.80}: not a recovery env type; {hint}")
 
     def find_policy(self) -> None:
         """Reads the type of the checkpoint that is named.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -99,21 +99,26 @@ def registered_classes(package: str, registry: str) -> Mapping[str, tuple[str, s
         if f"{registry}.register_subclass(" in path.read_text(encoding="utf-8"):
             parts = path.relative_to(file.parent).with_suffix("").parts if file is not None else ()
             module = ".".join((package, *parts))
-            found |= {name: (module, cls) for name, cls in _registrations(module, registry)}
+            found |= {name: (module, cls) for name, cls in registrations(module, registry).items()}
     return found
 
 
-def _registrations(module: str, registry: str) -> Iterator[tuple[str, str]]:
-    source = _source(module)
-    if source is None:
-        return
-    for node in source.classes.values():
+def registrations(module: str, registry: str) -> dict[str, str]:
+    """Returns the classes that a module registers, by the name that they are chosen by.
+
+    Args:
+        module: dotted name.
+        registry: class that they are registered with.
+    """
+    source, found = _source(module), {}
+    for node in source.classes.values() if source is not None else ():
         for decorator in node.decorator_list:
             match = _REGISTERED.fullmatch(ast.unparse(decorator).rstrip(")"))
             if match is not None and match[1] == registry:
                 name = match[2] or _constant(module, match[3])
                 if name:
-                    yield name, node.name
+                    found[name] = node.name
+    return found
 
 
 def _constant(module: str, name: str) -> str:

@@ -15,7 +15,7 @@ LEFT = {
     "evaluate": ["act-recovery/trials.jsonl", "act_clean-initial/eval_info.json", "report/report.html"],
     "scenarios": ["validated/meta/roborecover/scenarios.parquet", "on_my_scenarios/trials.jsonl"],
     "interventions": ["correction/model.safetensors", "monitor_report", "monitor_correction/trials.jsonl"],
-    "platform": ["crane_scenarios/meta/roborecover/manifest.json"],
+    "platform": ["crane_scenarios/meta/roborecover/manifest.json", "crane_report/report.html"],
 }
 """Files of each tutorial, below `outputs/tutorial`."""
 

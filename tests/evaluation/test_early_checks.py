@@ -25,6 +25,7 @@ REFUSALS = [
     (["eval", "--env=roborecover_metaworld"], "no policy: give a checkpoint with --policy.path="),
     (["eval", "--env", "roborecover_metawrld"], "the nearest is roborecover_metaworld"),
     (["eval", "--env.type=libero", f"--policy.path={POLICY}"], "the nearest is roborecover_libero"),
+    (["eval", "--env.type=pusht"], "give --env roborecover_wrapped --env.base.type=pusht"),
     (["check", "policy", "--env=metaworld"], "the nearest is roborecover_metaworld"),
     (["eval", *SOUND, "--evl.n_episodes=5"], "no option --evl.n_episodes; the nearest is --eval.n_episodes"),
     (["eval", *SOUND, "--eval.nepisodes", "5"], "the nearest is --eval.n_episodes"),

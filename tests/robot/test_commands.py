@@ -21,7 +21,7 @@ def refused(capsys, *words: str) -> str:
 
 def test_what_cannot_be_used_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "--policy.path: name the policy" in refused(capsys, "capture", *LAB)
+    assert "no policy: give a checkpoint with --policy.path" in refused(capsys, "capture", *LAB)
     assert "--rater: say who gives the verdicts" in refused(capsys, "run", *LAB, "--plan=plan.yaml")
     assert "plan.yaml" in refused(capsys, "run", *LAB, "--plan=plan.yaml", "--rater=kim")
     (tmp_path / "plan.yaml").write_text("points: points\npolicies: {a: {}}\n")
