@@ -18,6 +18,7 @@ from lerobot_roborecover.analysis.stats.crossfit import oracle
 from lerobot_roborecover.analysis.stats.groups import Group, group_rates, source_matrix
 from lerobot_roborecover.analysis.stats.intervals import UNDEFINED
 from lerobot_roborecover.analysis.stats.panel import Panel
+from lerobot_roborecover.analysis.stats.prefix import prefix_groups
 from lerobot_roborecover.analysis.stats.resampling import Resampling
 from lerobot_roborecover.analysis.stats.timing import FRACTIONS, budget_estimates, median_steps
 from lerobot_roborecover.analysis.stats.trial_metrics import (
@@ -51,6 +52,7 @@ def all_tables(results: Results) -> list[Table]:
         tables.append(ranks(results))
         tables += [table for table in [inversions(results)] if table.rows]
     tables += [grouped(results, *axis) for axis in _AXES]
+    tables += [table for table in [by_prefix(results)] if table.rows]
     if any(row.scenarios for row in source_matrix(results.recovery, results.draws)):
         tables.append(sources_by_policy(results))
     if len(results.recovery.arms) > 1:
@@ -86,6 +88,23 @@ def grouped(results: Results, label: str, name: str, title: str, heading: str) -
         ("RSR in %, N scenarios; intervals are over the group's own scenarios.",),
         sparse,
     )
+
+
+def by_prefix(results: Results) -> Table:
+    """RSR % by length of the prefix; without rows where the lengths make no groups."""
+    groups = prefix_groups(results.recovery, results.draws)
+    columns = (
+        Column("Prefix, steps"), Column("N", "count"),
+        *(Column(p, "percent") for p in results.recovery.arms),
+    )  # fmt: skip
+    notes = (
+        "RSR in %, N scenarios of about as long prefixes; intervals are over the group's own scenarios. Long "
+        "prefixes belong to other tasks and stages than short ones: a difference between groups is not what "
+        "the length alone does.",
+    )
+    rows = tuple((g.label, g.scenarios, *g.estimates) for g in groups)
+    sparse = frozenset(i for i, g in enumerate(groups) if g.underpowered)
+    return Table("prefix", "RSR by length of the prefix", columns, rows, notes, sparse)
 
 
 def _group_name(group: Group, label: str) -> str:

@@ -86,7 +86,7 @@ def run(options: LeaderboardOptions) -> int:
         print(f"not used: {name}: {reason}")
     print(f"page      {page}\ndata      {data}")
     if options.space.space:
-        _write_space(options.space, options.title, found)
+        _write_space(options.space, options.title, options.folder, found)
     if options.hub.hub:
         _offer(options.hub, options.folder, options.hub.hub, found)
     if options.hub.hub_board:
@@ -97,13 +97,15 @@ def run(options: LeaderboardOptions) -> int:
     return int(bool(found.refused))
 
 
-def _write_space(options: SpaceOptions, title: str, found: Leaderboard) -> None:
+def _write_space(options: SpaceOptions, title: str, logs: Path, found: Leaderboard) -> None:
     from lerobot_roborecover.analysis.named_path import split_named
     from lerobot_roborecover.analysis.pages.space import SpaceConfig, write_space
+    from lerobot_roborecover.logs.actions import ACTIONS_FOLDER
 
     assert options.space is not None
     media = [(name, Path(folder)) for name, folder in map(split_named, options.videos)]
-    for remark in write_space(found, options.space, SpaceConfig(title, options.render, media)):
+    actions = [folder for folder in sorted(logs.rglob(ACTIONS_FOLDER)) if folder.is_dir()]
+    for remark in write_space(found, options.space, SpaceConfig(title, options.render, media, actions)):
         print(f"note: {remark}", file=sys.stderr)
     print(f"space     {options.space}: hf upload ORG/NAME {options.space} --repo-type space")
 

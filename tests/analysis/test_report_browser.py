@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from lerobot_roborecover.analysis.analyse import analyse
@@ -12,6 +14,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo
 from lerobot_roborecover.analysis.pages.report import Extras, write_report
+from lerobot_roborecover.logs.actions import actions_digest, put_actions
 from tests.support.browser import open_page
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 
@@ -42,6 +45,10 @@ def report(tmp_path_factory):
         for k in range(2)
         for p in ("alpha@1", "beta@2")
     ]
+    actions = np.linspace(-1, 1, 300)[:, None] * [[1.0, -0.5]]
+    recorded = {"progress": list(range(101)), "actions_sha256": actions_digest(actions), "steps": 300}
+    rows = [replace(r, **recorded) if r.scenario_id == "s003" and r.trial == 0 else r for r in rows]
+    put_actions(root / "actions", actions, next(r for r in rows if r.actions_sha256))
     results = analyse(read_study([str(write_log(root / "log.jsonl", rows))]), Options(draws=200))
     frames = {s.id: png() for s in results.recovery.scenarios[::2]}
     clips = {"s003": [TrialVideo("alpha@1", "data:video/mp4;base64,AAAA")]}
@@ -146,6 +153,44 @@ def test_scroll_areas_links_and_marks_are_reachable(page):
     assert any("sim error, <b>died</b>" in text for text in words)
     label = page.get_attribute("li[data-id=s003] video", "aria-label")
     assert label == "alpha@1 on s003, trial 1, not solved"
+
+
+def test_one_click_opens_a_trial_and_escape_gives_the_focus_back(page):
+    card = page.locator("li[data-id=s003]")
+    sign = card.locator("dd[data-policy='alpha@1'] .signs[data-start=recovery] > button").first
+    assert sign.get_attribute("aria-label") == "alpha@1, trial 1: not solved"
+    sign.click()
+    dialog = page.locator("#trial")
+    dialog.wait_for()
+    assert page.text_content("#trial-title") == "alpha@1, trial 1: horizon"
+    assert page.text_content("#trial-about").endswith("s003, from the recovery point.")
+    assert dialog.locator("video").get_attribute("src").startswith("data:video/mp4")
+    assert dialog.locator("svg polyline").count() == 3, "progress and two numbers of the action"
+    facts = dict(
+        zip(dialog.locator("dt").all_text_contents(), dialog.locator("dd").all_text_contents(), strict=True)
+    )
+    assert facts["Outcome"] == "horizon after 300 of 300 steps"
+    assert facts["Handoff"].startswith("step 40; end effector 0.00 mm, objects 0.00 mm off")
+    assert facts["Interventions"] == "none"
+    page.click("#trial details summary")
+    row = json.loads(page.text_content("#trial-row"))
+    assert (row["scenario_id"], row["policy"], row["trial"]) == ("s003", "alpha@1", 0)
+    page.click("#trial-after")
+    assert page.text_content("#trial-title").startswith("alpha@1, trial 2: ")
+    assert dialog.locator("video, svg").count() == 0, "nothing was recorded of this one"
+    page.keyboard.press("Escape")
+    dialog.wait_for(state="hidden")
+    assert sign.evaluate("button => document.activeElement === button")
+    page.keyboard.press("Enter")
+    dialog.wait_for()
+    page.click("#trial form button:last-child")
+    dialog.wait_for(state="hidden")
+
+
+def test_an_invalid_trial_says_why(page):
+    page.click("li[data-id=s001] .signs > button:text-is('!')")
+    page.locator("#trial").wait_for()
+    assert "Reason<b>died</b>" in page.text_content("#trial-facts")
 
 
 def test_a_narrow_window_does_not_scroll_sideways(page):

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.figures.prefix import prefix_figure
 from lerobot_roborecover.analysis.figures.retries import retries
 from lerobot_roborecover.analysis.figures.runs import runs_figure
 from lerobot_roborecover.analysis.figures.slope import slope
@@ -47,6 +48,8 @@ def all_figures(results: Results) -> list[Figure]:
     if (found := slope(results)) is not None:
         figures.append(found)
     figures.append(cell_heat_map(results))
+    if (found := prefix_figure(results)) is not None:
+        figures.append(found)
     if matrix := source_matrix(results.recovery, results.draws):
         figures.append(source_heat_map(results, matrix))
     if several:
@@ -169,7 +172,7 @@ def _heat_map(
                 field = Rectangle(
                     (j - 0.48, i - low), 0.96, low + 0.46, fc=shades(values[i, j]) if known else "none",
                     ec=LINE if not known or sparse[i] else "none", lw=0.8, alpha=0.55 if sparse[i] else 1,
-                    hatch="...." if sparse[i] and known else None,
+                    hatch="///" if sparse[i] and known else None,
                 )  # fmt: skip
                 axes.add_patch(field)
                 dark = known and values[i, j] < 0.55

@@ -27,6 +27,8 @@ MOST_POLICIES = 12
 """Policies that the graph shows, the best at recovery first: more lines cannot be told apart."""
 _INCHES = 7.2
 """Width for a page: it stands beside videos."""
+_GAP = 0.09
+"""From a mark to its label, where the two axes are 1 apart."""
 _APART = 5.2
 """Per cent between two labels, so that they do not overlap."""
 
@@ -39,32 +41,59 @@ def slope(results: Results) -> Figure | None:
     if not every:
         return None
     shown = every[:MOST_POLICIES]
-    names = [results.recovery.arms[p] for p in shown]
-    ends = [[initial[p] for p in shown], [rsr[p] for p in shown]]
+    return slope_of(
+        [results.recovery.arms[p] for p in shown], [initial[p] for p in shown], [rsr[p] for p in shown],
+        of=len(every), styles=shown,
+    )  # fmt: skip
+
+
+def slope_of(
+    names: Sequence[str],
+    initial: Sequence[Estimate],
+    rsr: Sequence[Estimate],
+    of: int,
+    styles: Sequence[int] | None = None,
+) -> Figure:
+    """Returns the graph of these policies.
+
+    Args:
+        names: of at most `MOST_POLICIES`, the best at recovery first.
+        initial: success of each from initial states.
+        rsr: the same from recovery points.
+        of: policies that there are.
+        styles: index of each one's colour and marker; by default its place.
+    """
+    ends = [initial, rsr]
+    looks = styles or range(len(names))
 
     def draw(width: Width) -> Plot:
         with drawing() as subplots:
             plot, axes = subplots(width.inches if width.narrow else _INCHES, 4.2)
-            for p, name, before, after in zip(shown, names, *ends, strict=True):
+            for p, name, before, after in zip(looks, names, *ends, strict=True):
                 values = [100 * before.value, 100 * after.value]
                 axes.plot([0, 1], values, marker(p), ls="-", color=colour(p), lw=2.4, ms=8.5, label=name)
                 for x, estimate in ((0, before), (1, after)):
                     if not math.isnan(estimate.low):
                         bounds = [100 * estimate.low, 100 * estimate.high]
                         axes.plot([x, x], bounds, color=colour(p), lw=1.4, alpha=0.55)
-            gap = 0.07 if width.narrow else 0.03
-            limit = 15 if width.narrow else 22
+            limit, size, gap = (14, 8.5, "\n") if width.narrow else (22, 9.5, " ")
             places = [_spread_out([100 * e.value for e in end]) for end in ends]
-            for k, name in enumerate(names):
-                before, after = (f"{100 * end[k].value:.1f}" for end in ends)
-                left = before if width.narrow else f"{short(name, limit)}   {before}"
-                axes.text(-gap, places[0][k], left, ha="right", va="center", fontsize=9.5)
-                axes.text(1 + gap, places[1][k], f"{after}   {short(name, limit)}", va="center", fontsize=9.5)
+            for k, (p, name) in enumerate(zip(looks, names, strict=True)):
+                values = [100 * end[k].value for end in ends]
+                texts = f"{_short(name, limit)}  {values[0]:.1f}", f"{values[1]:.1f}  {_short(name, limit)}"
+                for x, side in ((0, -1), (1, 1)):
+                    at = x + side * _GAP
+                    # From the mark to its label, which may stand higher or lower.
+                    axes.plot([x, at], [values[x], places[x][k]], color=colour(p), lw=0.8, alpha=0.7)
+                    where = {"ha": "right" if side < 0 else "left", "va": "center", "fontsize": size}
+                    axes.text(at + side * 0.015, places[x][k], texts[x], **where)
             every_place = np.concatenate(places)
             axes.set(
-                xlim=(-0.3, 1.95) if width.narrow else (-0.85, 1.85),
+                xlim=(-0.85, 1.85) if width.narrow else (-0.9, 1.9),
                 ylim=(min(0, every_place.min() - 3), max(100, every_place.max() + 3)), xticks=[0, 1],
-                xticklabels=["initial states, %", "recovery points, %"],
+                xticklabels=[
+                    f"initial{gap}states, %", f"recovery{gap}points, %"
+                ],
             )  # fmt: skip
             axes.set_yticks([])
             for x in (0, 1):
@@ -73,9 +102,12 @@ def slope(results: Results) -> Figure | None:
             axes.tick_params(length=0, labelcolor=SOFT)
         return plot
 
-    return Figure(
-        "slope", "From initial states to recovery points", _words(names, ends, len(every)), *both(draw)
-    )
+    return Figure("slope", "From initial states to recovery points", _words(names, ends, of), *both(draw))
+
+
+def _short(name: str, limit: int) -> str:
+    """A name that fits: its beginning and its end, since names of one series differ at their ends."""
+    return short(name if len(name) <= limit else f"{name[: limit - 9]}…{name[-8:]}", limit)
 
 
 def _words(names: Sequence[str], ends: Sequence[Sequence[Estimate]], count: int) -> str:

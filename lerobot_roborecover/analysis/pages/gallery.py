@@ -6,10 +6,12 @@ import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.analysis.pages.trial_details import ShownTrial, packed_within
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.logs.row import TrialRow
@@ -85,6 +87,8 @@ class Card:
     """Standard deviation of the policies' rates, in [0, 0.5]."""
     rate: float
     """Mean of the policies' rates."""
+    trials: str = ""
+    """Its trials, see `trial_details.packed`; empty where the page has no room for them."""
 
 
 def make_cards(
@@ -92,6 +96,8 @@ def make_cards(
     frames: Mapping[str, bytes | str],
     clips: Mapping[str, Sequence[TrialVideo]],
     initial: Panel | None = None,
+    interventions: Panel | None = None,
+    action_folders: Sequence[Path] = (),
 ) -> list[Card]:
     """Cards of all scenarios, those on which policies disagree most first.
 
@@ -100,13 +106,27 @@ def make_cards(
         frames: PNG or JPEG files by scenario id: their content, or their path from the page.
         clips: videos by scenario id.
         initial: trials of the same policies from initial states.
+        interventions: trials of arms that are no policies; those that are in `panel`, too, are shown once.
+        action_folders: where actions of the trials were recorded.
     """
     before = _initial_rows(initial)
     numbers = {policy: p for p, policy in enumerate(panel.arms)}
-    cards = []
+    acting = _acting(panel, interventions)
+    cards: list[Card] = []
+    trials: dict[str, list[ShownTrial]] = {}
     for n, scenario in enumerate(panel.scenarios):
         rates = panel.rates[:, n]
         run = rates[np.isfinite(rates)]
+        shown = {
+            arm: (panel.rows.get((p, n), ()), int(panel.trials[p, n])) for p, arm in enumerate(panel.arms)
+        }
+        shown |= {arm: of[scenario.id] for arm, of in acting.items() if scenario.id in of}
+        trials[scenario.id] = [
+            ShownTrial(arm, start, k, row)
+            for arm, (rows, _) in shown.items()
+            for start, own in (("recovery", rows), ("initial", before.get((arm, scenario.id), ())))
+            for k, row in enumerate(own)
+        ]
         cards.append(
             Card(
                 id=scenario.id,
@@ -118,13 +138,8 @@ def make_cards(
                 source_policy=scenario.source_policy,
                 frame=_image_uri(frames.get(scenario.id, "")),
                 marks=tuple(
-                    _marks(
-                        panel.arms[p],
-                        panel.rows.get((p, n), ()),
-                        int(panel.trials[p, n]),
-                        before.get((panel.arms[p], scenario.id), ()),
-                    )
-                    for p in range(len(panel.arms))
+                    _marks(arm, rows, scheduled, before.get((arm, scenario.id), ()))
+                    for arm, (rows, scheduled) in shown.items()
                 ),
                 clips=tuple(
                     _with_outcome(clip, panel.rows.get((numbers.get(clip.policy, -1), n), ()))
@@ -135,7 +150,26 @@ def make_cards(
                 rate=float(run.mean()),
             )
         )
-    return sorted(cards, key=lambda card: (-card.disagreement, card.id))
+    cards.sort(key=lambda card: (-card.disagreement, card.id))
+    texts = packed_within([trials[card.id] for card in cards], action_folders)
+    return [replace(card, trials=text) for card, text in zip(cards, texts, strict=True)]
+
+
+def _acting(
+    panel: Panel, interventions: Panel | None
+) -> dict[str, dict[str, tuple[Sequence[TrialRow], int]]]:
+    """Rows of every arm that is no policy, and how many there should be, by scenario id."""
+    if interventions is None:
+        return {}
+    return {
+        arm: {
+            scenario.id: (interventions.rows.get((p, n), ()), int(interventions.trials[p, n]))
+            for n, scenario in enumerate(interventions.scenarios)
+            if interventions.trials[p, n]
+        }
+        for p, arm in enumerate(interventions.arms)
+        if arm not in panel.arms
+    }
 
 
 def _with_outcome(clip: TrialVideo, rows: Sequence[TrialRow]) -> TrialVideo:
@@ -237,6 +271,7 @@ def gallery_values(cards: Sequence[Card]) -> dict[str, Any]:
         },
         "outcome_classes": {k: v for k, v in OUTCOME_CLASSES.items() if k in present},
         "signs": SIGNS,
+        "untold": sum(not card.trials for card in cards),
         "policies": policies,
     }
 

@@ -5,21 +5,43 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.board import Board, Entry, ranks, separated
+from lerobot_roborecover.analysis.figures.slope import MOST_POLICIES, slope_of
 from lerobot_roborecover.analysis.leaderboard import Leaderboard, as_json
-from lerobot_roborecover.analysis.pages.page import render_page
+from lerobot_roborecover.analysis.pages.gallery import Card, choose_pair
+from lerobot_roborecover.analysis.pages.page import picture, render_page, without_folders
 from lerobot_roborecover.analysis.stats.macro import MACRO_9
+from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.analysis.stats.verdicts import ComparisonVerdict
 from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.platforms.registry import env_type_of
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.outputs import claim_page
 
+FRAMES_SHOWN = 6
+"""Recovery frames above a board: of the scenarios on which policies disagree most."""
+
+
+@dataclass(frozen=True)
+class BoardGallery:
+    """The page of a board's scenarios, and what of it the leaderboard shows."""
+
+    page: str
+    """File name, beside the leaderboard's."""
+    cards: Sequence[Card]
+
 
 def write_leaderboard(
-    found: Leaderboard, out: Path, title: str = "Recovery leaderboard", galleries: Sequence[str] = ()
+    found: Leaderboard,
+    out: Path,
+    title: str = "Recovery leaderboard",
+    galleries: Sequence[BoardGallery] = (),
 ) -> tuple[Path, Path]:
     """Writes `index.html` and `leaderboard.json`.
 
@@ -27,23 +49,54 @@ def write_leaderboard(
         found: what to show.
         out: folder; made if need be.
         title: heading of the page.
-        galleries: pages of the boards' scenarios, beside this one, where there are some.
+        galleries: of each board, where there are some.
     """
     boards = [
         {
             "board": board,
             "table": board_table(board, n),
             "published": published_table(board.platform),
-            "gallery": galleries[n] if galleries else "",
+            "slope": board_slope(board),
+            "submit": commands_to_submit(board, trials.recovery),
+            "gallery": galleries[n].page if galleries else "",
+            "frames": [c for c in galleries[n].cards if c.frame][:FRAMES_SHOWN] if galleries else [],
+            "pair": choose_pair(galleries[n].cards) if galleries else None,
         }
-        for n, board in enumerate(found.boards)
+        for n, (board, trials) in enumerate(zip(found.boards, found.trials, strict=True))
     ]
-    page = render_page("leaderboard.html.j2", title=title, boards=boards, refused=found.refused)
+    page = render_page(
+        "leaderboard.html.j2", title=title, boards=boards, refused=found.refused, with_files=bool(galleries)
+    )
     files = out / "index.html", out / "leaderboard.json"
     with claim_page(out, [path.name for path in files]):
         for path, text in zip(files, (page, json.dumps(as_json(found), indent=1)), strict=True):
             atomic_write(path, text)
         return files
+
+
+def board_slope(board: Board) -> dict[str, str] | None:
+    """The ranked policies from initial states and from recovery points; None where none has both."""
+    ranked = [e for e in board.entries if e.place and not math.isnan(e.initial.value)]
+    if not ranked:
+        return None
+    shown = ranked[:MOST_POLICIES]
+    names = [entry.policy for entry in shown]
+    ends = [entry.initial for entry in shown], [entry.rsr for entry in shown]
+    return picture(slope_of(names, *ends, of=len(ranked)))
+
+
+def commands_to_submit(board: Board, panel: Panel) -> str:
+    """What makes an entry of a board: both starts of its scenario set."""
+    row = next(iter(panel.rows.values()))[0]
+    what = f"--env {env_type_of(board.platform)} --env.scenarios={without_folders(row.dataset)}"
+    what += f" --env.revision={row.dataset_revision}" if row.dataset_revision else ""
+    what += f" --env.split={row.split}" if row.split else ""
+    trials = int(np.median(panel.trials[panel.trials > 0]))
+    what += f" \\\n    --policy.path=CHECKPOINT --eval.n_episodes={trials}"
+    return (
+        f"roborecover eval {what} --output_dir=mine/recovery\n"
+        f"roborecover eval {what} --env.start=initial --output_dir=mine/initial"
+    )
 
 
 def board_table(board: Board, number: int = 0) -> Table:

@@ -29,6 +29,7 @@ from lerobot_roborecover.analysis.pages.page import (
     render_page,
     without_folders,
 )
+from lerobot_roborecover.analysis.pages.trial_details import action_folders
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.intervals import Estimate
@@ -47,6 +48,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("ranks", "", ("ranks", "inversions")),
     ("differences", "paired_differences", ("contrasts", "profiles")),
     ("cells", "cells", ("cells", "sources", "suites")),
+    ("prefix", "prefix", ("prefix",)),
     ("sources", "source_matrix", ("source_matrix",)),
     ("oracle", "oracle", ("oracle",)),
     ("time", "time_to_recover", ("budgets", "trial_metrics")),
@@ -64,6 +66,7 @@ _HEADINGS = {
     "ranks": "Initial states against recovery",
     "differences": "Which policies differ",
     "cells": "Where policies recover",
+    "prefix": "How far into the task",
     "sources": "Whose deviations",
     "oracle": "What is left to gain",
     "time": "How fast",
@@ -136,7 +139,10 @@ def write_report(results: Results, out: Path, extras: Extras | None = None) -> R
         atomic_write(
             out / "report.md", _markdown(results, tables, images, remarks, provenance, extras).encode()
         )
-        cards = make_cards(results.recovery, extras.frames, extras.clips, results.initial)
+        cards = make_cards(
+            results.recovery, extras.frames, extras.clips, results.initial, results.interventions,
+            action_folders(results.study.logs),
+        )  # fmt: skip
         atomic_write(
             out / "report.html", _html(results, tables, images, cards, remarks, provenance, extras).encode()
         )
@@ -261,7 +267,7 @@ def _html(
     return render_page(
         "report.html.j2",
         title=extras.title,
-        scripts=("gallery.js",),
+        scripts=("gallery.js", "trial.js"),
         claim=found.claim,
         limits=found.limits,
         first=images.get(first),

@@ -11,7 +11,7 @@ from pathlib import Path
 from lerobot_roborecover.analysis.board import Board, BoardTrials
 from lerobot_roborecover.analysis.leaderboard import Leaderboard
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo, check_scenarios, gallery_values, make_cards
-from lerobot_roborecover.analysis.pages.leaderboard import write_leaderboard
+from lerobot_roborecover.analysis.pages.leaderboard import BoardGallery, write_leaderboard
 from lerobot_roborecover.analysis.pages.media import find_media
 from lerobot_roborecover.analysis.pages.page import render_page
 from lerobot_roborecover.analysis.stats.panel import Panel
@@ -32,6 +32,8 @@ class SpaceConfig:
     """Render recovery frames that the scenario sets do not hold; runs the simulators."""
     media: Sequence[tuple[str, Path]] = ()
     """A policy's name and the folder of its videos or `.rrd` recordings."""
+    action_folders: Sequence[Path] = ()
+    """Where actions of the trials were recorded."""
 
 
 def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None) -> list[str]:
@@ -53,21 +55,25 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
     remarks: list[str] = []
     pages = [f"scenarios-{n + 1}.html" for n in range(len(found.boards))]
     with claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages]):
-        write_leaderboard(found, out, config.title, pages)
+        galleries = []
         for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
             frames, problems = _frames(board, trials, out, config.render)
             clips = _media(config.media, trials.recovery, out)
-            cards = make_cards(trials.recovery, frames, clips, trials.initial)
+            cards = make_cards(
+                trials.recovery, frames, clips, trials.initial, action_folders=config.action_folders
+            )
+            galleries.append(BoardGallery(name, cards))
             page = render_page(
                 "gallery_page.html.j2",
                 title=f"{config.title}: {board.platform}, {board.dataset}",
-                scripts=("gallery.js",),
+                scripts=("gallery.js", "trial.js"),
                 with_files=True,
                 board=board,
                 **gallery_values(cards),
             )
             atomic_write(out / name, page)
             remarks += [f"{board.dataset}: {problem}" for problem in problems]
+        write_leaderboard(found, out, config.title, galleries)
         used = {policy for policy, _ in config.media}
         policies = {arm for trials in found.trials for arm in trials.recovery.arms}
         if used - policies:
