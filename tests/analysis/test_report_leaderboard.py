@@ -129,6 +129,10 @@ def test_json_and_page(tmp_path):
         shown.locator("summary").first.click()
         assert shown.locator("details[open] dd").first.is_visible()
         assert "<i>a</i>" in shown.locator("tbody tr").first.text_content()
+        command = shown.locator("details pre").text_content()
+        assert "--env roborecover_libero --env.scenarios=made-up --env.revision=r1 " in command
+        assert command.count("--eval.n_episodes=2") == command.count("roborecover eval") == 2
+        assert shown.locator("#submit").count() == 1
         assert complaints == []
 
 

@@ -253,7 +253,10 @@ def _html(
     heads = {arm.title for arm in results.study.arms}
     heads |= {without_folders(str(path)) for path in results.study.logs}
     found = headline_of(results)
-    first = next((name for name in ("slope", "forest") if name in images), "")
+    first, pair = next((name for name in ("slope", "forest") if name in images), ""), choose_pair(cards)
+    shown = images.get(first)
+    if shown and pair and first == "forest":  # there is half a page beside the videos
+        shown = {**shown, "uri": shown["narrow"]}
     sections = [
         {
             "anchor": anchor,
@@ -270,8 +273,8 @@ def _html(
         scripts=("gallery.js", "trial.js"),
         claim=found.claim,
         limits=found.limits,
-        first=images.get(first),
-        pair=choose_pair(cards),
+        first=shown,
+        pair=pair,
         introduction=extras.introduction,
         remarks=grouped(remarks, [*heads, *results.study.policies]),
         sections=sections,

@@ -44,13 +44,13 @@
     if (text) made.textContent = text;
     return made;
   };
-  const WIDE = 460;
-  const LEFT = 88;
+  const LEFT = 92;
+  const width = () => Math.max(280, Math.min(460, innerWidth - 56)); // about one unit a pixel
   // One line of a chart: its name and range at the left, values from 0 to `top` over the trial's steps.
-  const line = (svg, y, tall, name, range, values, top) => {
-    const x = (k) => LEFT + (WIDE - LEFT - 4) * (values.length > 1 ? k / (values.length - 1) : 0);
+  const line = (svg, wide, y, tall, name, range, values, top) => {
+    const x = (k) => LEFT + (wide - LEFT - 4) * (values.length > 1 ? k / (values.length - 1) : 0);
     svg.append(
-      drawn("rect", { x: LEFT, y, width: WIDE - LEFT - 4, height: tall, class: "field" }),
+      drawn("rect", { x: LEFT, y, width: wide - LEFT - 4, height: tall, class: "field" }),
       drawn("text", { x: 0, y: y + 12, class: "name" }, name),
       drawn("text", { x: 0, y: y + 25, class: "range" }, range),
       drawn("polyline", { points: values.map((v, k) => x(k).toFixed(1) + "," + (y + tall - 2 - (tall - 4) * v / top).toFixed(1)).join(" ") }),
@@ -60,26 +60,28 @@
     .map((one) => (Array.isArray(one) ? one[1] : one.step)).filter((step) => Number.isFinite(step));
   const chart = (trial, row) => {
     const lines = [];
+    const wide = width();
+    const rounded = (value) => Number(value.toPrecision(2));
     if (trial.progress) lines.push(["progress", "0 to 100 %", trial.progress, 100, 60]);
     if (trial.actions) {
       trial.actions.levels.forEach((values, k) => lines.push(
-        [trial.actions.names[k], trial.actions.low[k] + " to " + trial.actions.high[k], values, 99, 34]));
+        [trial.actions.names[k], rounded(trial.actions.low[k]) + " to " + rounded(trial.actions.high[k]), values, 99, 34]));
     }
     if (!lines.length) return null;
     const tall = lines.reduce((sum, one) => sum + one[4] + 6, 0);
-    const svg = drawn("svg", { viewBox: "0 0 " + WIDE + " " + (tall + 20), role: "img",
+    const svg = drawn("svg", { viewBox: "0 0 " + wide + " " + (tall + 20), role: "img",
       "aria-label": "Over " + row.steps + " steps: " + lines.map((one) => one[0]).join(", ") });
     let y = 0;
     for (const [name, range, values, top, height] of lines) {
-      line(svg, y, height, name, range, values, top);
+      line(svg, wide, y, height, name, range, values, top);
       y += height + 6;
     }
     for (const step of stepsOf(row)) {
-      const x = LEFT + (WIDE - LEFT - 4) * Math.min(1, step / Math.max(1, row.steps));
+      const x = LEFT + (wide - LEFT - 4) * Math.min(1, step / Math.max(1, row.steps));
       svg.append(drawn("line", { x1: x, x2: x, y1: 0, y2: tall, class: "mark" }));
     }
     svg.append(drawn("text", { x: LEFT, y: tall + 14, class: "range" }, "handoff"),
-      drawn("text", { x: WIDE - 4, y: tall + 14, class: "range", "text-anchor": "end" }, "step " + row.steps));
+      drawn("text", { x: wide - 4, y: tall + 14, class: "range", "text-anchor": "end" }, "step " + row.steps));
     return svg;
   };
 
