@@ -92,6 +92,12 @@ def test_two_policies_side_by_side(space, tmp_path):
     with open_page(out / "index.html", tmp_path / "profile") as (page, complaints):
         links = page.locator("p > a[href^=scenarios-]:not([href*='#'])")
         assert links.count() == 2
+        assert page.locator("#submit pre").count() == 1
+        assert page.locator(".pair video").count() == 2
+        assert page.locator(".first img[alt^='Success in per cent']").count() == 1
+        page.set_viewport_size({"width": 375, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 375
+        page.set_viewport_size({"width": 1200, "height": 900})
         page.goto((out / "scenarios-2.html").as_uri())
         if page.locator("#cards > li").count() != COUNT:
             page.goto((out / "scenarios-1.html").as_uri())
