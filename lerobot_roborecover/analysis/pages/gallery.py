@@ -117,7 +117,7 @@ def make_cards(
     for n, scenario in enumerate(panel.scenarios):
         rates = panel.rates[:, n]
         run = rates[np.isfinite(rates)]
-        shown = {
+        shown: dict[str, tuple[Sequence[TrialRow], int]] = {
             arm: (panel.rows.get((p, n), ()), int(panel.trials[p, n])) for p, arm in enumerate(panel.arms)
         }
         shown |= {arm: of[scenario.id] for arm, of in acting.items() if scenario.id in of}
