@@ -102,6 +102,7 @@ class Recorder:
         self._notes = notes_of(robot, fps)
         self._dataset: Any = None
         self._truth: list[dict[str, Any]] = []
+        self._seen: dict[str, Any] | None = None
         self._frames = 0
         before = read_notes(root)
         if before is not None and before != self._notes:
@@ -124,7 +125,13 @@ class Recorder:
 
     def begin(self) -> None:
         """Begins an episode; files are opened with its first frame, so that an empty one leaves none."""
-        self._frames, self._truth = 0, []
+        self._frames, self._truth, self._seen = 0, [], None
+
+    def observed(self) -> None:
+        """Keeps the simulated lab's own state for the frame whose observation was just taken: once the action
+        is sent, objects are elsewhere."""
+        if hasattr(self._robot, "hidden_truth"):
+            self._seen = self._robot.hidden_truth()
 
     def _open(self) -> None:
         from lerobot.datasets import LeRobotDataset
@@ -152,8 +159,8 @@ class Recorder:
         if self._dataset is None:
             self._open()
         self._dataset.add_frame({**frame, INTERVENTION: np.array([intervention]), "task": task})
-        if hasattr(self._robot, "hidden_truth"):
-            self._truth.append(self._robot.hidden_truth())
+        if self._seen is not None:
+            self._truth.append(self._seen)
         self._frames += 1
 
     def save(self) -> int | None:

@@ -72,6 +72,7 @@ def restore(
     )
     if said.button == "skip":
         return over("skipped by the operator before the arm moved")
+    check.see_table(robot)
     try:
         console.show("moving", "The arm moves slowly. Stop it with the red button or Space.", (), details)
         move_to(
@@ -84,6 +85,7 @@ def restore(
         )
     except StoppedError as err:
         return over(str(err))
+    check.see_cleared(robot)
     last = float("-inf")
 
     def look() -> None:

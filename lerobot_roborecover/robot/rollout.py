@@ -109,6 +109,7 @@ class RecordedRollout(RolloutStrategy):
             if over:
                 return
             observation = robot.get_observation()
+            self._recorder.observed()
             if problem := self._frozen(robot, observation, tick):
                 self.end.ended, self.end.problem = "trouble", problem
                 return

@@ -82,6 +82,7 @@ class StartCheck:
     def __init__(self, points: PointSet, point: RobotPoint, tolerance: Tolerance):
         self.point, self.tolerance = point, tolerance
         self.references: dict[str, Reference] = {}
+        self._table: dict[str, Any] = {}
         for camera, frames in points.pictures(point).items():
             reference = Reference.of(frames)
             drawn = [tuple(box) for box in point.boxes.get(camera, ())]
@@ -102,6 +103,27 @@ class StartCheck:
                     f"{reference.picture.shape}: set its width and height as they were in --robot.cameras"
                 )
         return observation
+
+    def see_table(self, robot: Any) -> None:
+        """Looks at the cleared table before the arm moves to the point.
+
+        Raises:
+            RobotError: see `look`.
+        """
+        self._table = self._latest(robot)
+
+    def see_cleared(self, robot: Any) -> None:
+        """Looks at the cleared table with the arm at the point; after `see_table`.
+
+        Raises:
+            RobotError: see `look`.
+        """
+        live = self._latest(robot)
+        self.references = {c: r.with_cleared(self._table[c], live[c]) for c, r in self.references.items()}
+
+    def _latest(self, robot: Any) -> dict[str, Any]:
+        """An observation without pictures that are late."""
+        return [self.look(robot) for _ in range(_LOOKS)][-1]
 
     def measure(self, robot: Any) -> tuple[StartError, Mapping[str, np.ndarray]]:
         """The start error, and the live pictures that it was measured on.

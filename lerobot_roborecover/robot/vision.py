@@ -2,8 +2,11 @@
 
 The order matters. The arm is put back first, so that it covers the same pixels in both pictures. The camera
 is judged on the static background: pixels that did not change while the episode was recorded. Only after its
-shift is taken out are objects compared, where people have drawn them, or on the foreground of the recovery
-point. LeRobot #4496 shows what happens otherwise: a tripod that moved is scored as the policy's failure.
+shift is taken out are objects compared: what the recorded picture has more than one of the cleared table, the
+arm where it was. The arm is in both and drops out, and where it covers an object nothing is compared. Without
+a picture of the cleared table, the regions that people have drawn are compared, or the foreground of the
+recovery point, arm and all. LeRobot #4496 shows what happens otherwise: a tripod that moved is scored as the
+policy's failure.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ _BORDER = 0.06
 """Share of a picture's sides that no match may lean on: a shift brings in what the other does not show."""
 _SEARCH = 0.2
 """How far an object is looked for, as a share of the picture's side."""
+_ALIKE = 0.15
+"""Scores of an object behind the arm that differ by less do not tell its places apart."""
 _TAGS = cv2.aruco.DICT_4X4_50
 _MAX_ORB_RESIDUAL_PX = 1.5
 
@@ -39,6 +44,14 @@ class Reference:
     """(H, W) bool: background that did not change."""
     objects: np.ndarray
     """(H, W) bool: foreground of the recovery point, or what people have drawn."""
+    background: np.ndarray | None = None
+    """(H, W, 3) uint8: median of the episode's moments; None of one moment alone."""
+    drawn: bool = False
+    """People have drawn `objects`."""
+    cleared: np.ndarray | None = None
+    """(H, W, 3) uint8: the arm as in `picture`, and no objects; None where the table was not cleared."""
+    arm: np.ndarray | None = None
+    """(H, W) bool: where the arm stands in `cleared`."""
 
     @classmethod
     def of(cls, frames: np.ndarray) -> Reference:
@@ -61,7 +74,8 @@ class Reference:
         # The arm is part of the foreground, too: at the same joints it has not shifted, and does no harm.
         foreground = np.abs(smooth[-1] - np.sort(smooth, axis=0)[len(smooth) // 2]) > _CHANGED
         objects = cv2.dilate(foreground.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-        return cls(picture, static, objects if objects.any() else changed)
+        background = np.median(frames, 0).astype(np.uint8)
+        return cls(picture, static, objects if objects.any() else changed, background)
 
     def with_boxes(self, boxes: list[tuple[int, int, int, int]]) -> Reference:
         """The same with object regions that a person has drawn.
@@ -72,7 +86,20 @@ class Reference:
         objects = np.zeros_like(self.objects)
         for left, top, width, height in boxes:
             objects[top : top + height, left : left + width] = True
-        return replace(self, objects=objects, static=self.static & ~objects)
+        return replace(self, objects=objects, static=self.static & ~objects, drawn=True)
+
+    def with_cleared(self, before: np.ndarray, live: np.ndarray) -> Reference:
+        """The same with pictures of the cleared table.
+
+        Args:
+            before: (H, W, 3) uint8, with the arm elsewhere.
+            live: (H, W, 3) uint8, with the arm where it was.
+        """
+        elsewhere, cleared = (_aligned(p, background_shift(self, p)) for p in (before, live))
+        arm = _differ(cleared, elsewhere, 0.5, 2 * _CHANGED)
+        if self.background is not None:  # where the arm stood before, the table looks as in the episode
+            arm &= _differ(cleared, self.background, 0.5, 2 * _CHANGED)
+        return replace(self, cleared=cleared, arm=arm)
 
 
 def compare(reference: Reference, live: np.ndarray, tag_side_mm: float | None = None) -> CameraError:
@@ -84,12 +111,8 @@ def compare(reference: Reference, live: np.ndarray, tag_side_mm: float | None = 
         tag_side_mm: side of the fiducial tags (ArUco 4x4_50) in the scene; None looks for none.
     """
     shift = background_shift(reference, live)
-    if shift is None:
-        shift_px, aligned = None, live
-    else:
-        shift_px = float(np.hypot(*shift))
-        aligned = _moved(live, (-shift[0], -shift[1]))
-    object_px, similarity = object_shift(reference, aligned)
+    shift_px = None if shift is None else float(np.hypot(*shift))
+    object_px, similarity = object_shift(reference, _aligned(live, shift))
     tag_mm = None if tag_side_mm is None else tag_shift_mm(reference.picture, live, tag_side_mm)
     return CameraError(shift_px, object_px, similarity, tag_mm)
 
@@ -171,29 +194,102 @@ def object_shift(reference: Reference, live: np.ndarray) -> tuple[float | None, 
     Returns:
         None each where the region is too small, or has no structure.
     """
-    boxes = _boxes(reference.objects)
-    shifts, similarities = [], []
-    side = max(reference.picture.shape[:2])
-    reach = max(round(_SEARCH * side), 3)
-    for left, top, width, height in boxes:
-        patch = reference.picture[top : top + height, left : left + width]
-        mask = reference.objects[top : top + height, left : left + width]
-        y0, x0 = max(top - reach, 0), max(left - reach, 0)
-        around = live[y0 : top + height + reach, x0 : left + width + reach]
-        if around.shape[0] <= height or around.shape[1] <= width or patch.std() < 2.0:
-            continue
-        weights = np.repeat(mask.astype(np.float32)[..., None], 3, 2)
-        scores = cv2.matchTemplate(
-            around.astype(np.float32), patch.astype(np.float32), cv2.TM_CCOEFF_NORMED, mask=weights
-        )
-        scores = np.where(np.isfinite(scores), scores, -1.0)
-        row, column = np.unravel_index(int(scores.argmax()), scores.shape)
-        fine_row, fine_column = _peak(scores, int(row), int(column))
-        shifts.append(float(np.hypot(x0 + fine_column - left, y0 + fine_row - top)))
-        similarities.append(float(np.clip(scores[row, column], -1.0, 1.0)))
-    if not shifts:
+    reach = max(round(_SEARCH * max(reference.picture.shape[:2])), 3)
+    added = _added(reference)
+    if added is not None:
+        found = [_behind_the_arm(reference, live, _padded(box, added.shape), reach) for box in _boxes(added)]
+    else:
+        found = [_as_drawn(reference, live, box, reach) for box in _boxes(reference.objects)]
+    kept = [pair for pair in found if pair is not None]
+    if not kept:
         return None, None
-    return max(shifts), min(similarities)
+    return max(shift for shift, _ in kept), min(similarity for _, similarity in kept)
+
+
+def _as_drawn(
+    reference: Reference, live: np.ndarray, box: tuple[int, int, int, int], reach: int
+) -> tuple[float, float] | None:
+    """Shift and similarity of a region, with everything that is seen in it."""
+    left, top, width, height = box
+    patch = reference.picture[top : top + height, left : left + width]
+    mask = reference.objects[top : top + height, left : left + width]
+    y0, x0 = max(top - reach, 0), max(left - reach, 0)
+    around = live[y0 : top + height + reach, x0 : left + width + reach]
+    if around.shape[0] <= height or around.shape[1] <= width or patch.std() < 2.0:
+        return None
+    weights = np.repeat(mask.astype(np.float32)[..., None], 3, 2)
+    scores = cv2.matchTemplate(
+        around.astype(np.float32), patch.astype(np.float32), cv2.TM_CCOEFF_NORMED, mask=weights
+    )
+    scores = np.where(np.isfinite(scores), scores, -1.0)
+    row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+    fine_row, fine_column = _peak(scores, int(row), int(column))
+    shift = float(np.hypot(x0 + fine_column - left, y0 + fine_row - top))
+    return shift, float(np.clip(scores[row, column], -1.0, 1.0))
+
+
+def _behind_the_arm(
+    reference: Reference, live: np.ndarray, box: tuple[int, int, int, int], reach: int
+) -> tuple[float, float] | None:
+    """Shift and similarity of an object: what either picture has more than the cleared table, compared where
+    the arm covers the object in neither."""
+    assert reference.cleared is not None
+    assert reference.arm is not None
+    left, top, width, height = box
+    free = ~reference.arm
+    recorded = (reference.picture.astype(np.float32) - reference.cleared) * free[..., None]
+    seen = (live.astype(np.float32) - reference.cleared) * free[..., None]
+    edge = ((reach, reach), (reach, reach))
+    around = np.pad(seen, (*edge, (0, 0)))[top : top + height + 2 * reach, left : left + width + 2 * reach]
+    open_there = np.pad(free, edge)[top : top + height + 2 * reach, left : left + width + 2 * reach]
+    patch = recorded[top : top + height, left : left + width]
+    open_here = free[top : top + height, left : left + width].astype(np.float32)
+    there = open_there.astype(np.float32)
+
+    def sums(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+        """(2 reach + 1, 2 reach + 1) sums of products at every shift."""
+        return cv2.matchTemplate(image.astype(np.float32), kernel.astype(np.float32), cv2.TM_CCORR)
+
+    own, other = sums(there, (patch**2).sum(-1)), sums((around**2).sum(-1), open_here)
+    both = np.sum([sums(around[..., k], patch[..., k]) for k in range(3)], 0)
+    least = 0.1 * own.max()
+    scores = np.where((own > least) & (other > 0), 2 * both / np.maximum(own + other, 1e-6), -1.0)
+    if scores.max() <= 0:
+        return None
+    # What the arm leaves of an object may fit in several places: it is at the nearest of those that fit.
+    tops = (scores >= cv2.dilate(scores, np.ones((3, 3)))) & (scores >= scores.max() - _ALIKE)
+    rows, columns = np.nonzero(tops)
+    nearest = int(np.hypot(rows - reach, columns - reach).argmin())
+    row, column = rows[nearest], columns[nearest]
+    fine_row, fine_column = _peak(scores, int(row), int(column))
+    shift = float(np.hypot(fine_column - reach, fine_row - reach))
+    return shift, float(np.clip(scores[row, column], -1.0, 1.0))
+
+
+def _added(reference: Reference) -> np.ndarray | None:
+    """(H, W) bool: what the recorded picture has more than the cleared table; None where that is nothing."""
+    if reference.cleared is None:
+        return None
+    gap = _differ(reference.picture, reference.cleared, 0.8, _CHANGED).astype(np.uint8)
+    # An arm that stands a fraction of a pixel off leaves thin lines along its edges.
+    found = cv2.morphologyEx(gap, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    added = cv2.dilate(found, np.ones((3, 3), np.uint8)).astype(bool)
+    if reference.drawn:
+        added &= reference.objects
+    return added if added.sum() >= _MIN_REGION_PX else None
+
+
+def _differ(one: np.ndarray, other: np.ndarray, blur_px: float, levels: float) -> np.ndarray:
+    """(H, W) bool: where two pictures differ by more than so many levels in a colour, after smoothing."""
+    smooth = (cv2.GaussianBlur(p.astype(np.float32), (0, 0), blur_px) for p in (one, other))
+    return np.abs(np.subtract(*smooth)).max(-1) > levels
+
+
+def _padded(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """A box with a margin, within a picture."""
+    left, top = max(box[0] - 2, 0), max(box[1] - 2, 0)
+    right, bottom = min(box[0] + box[2] + 2, shape[1]), min(box[1] + box[3] + 2, shape[0])
+    return left, top, right - left, bottom - top
 
 
 def _peak(scores: np.ndarray, row: int, column: int) -> tuple[float, float]:
@@ -274,6 +370,11 @@ def _moved(picture: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
     matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
     size = (picture.shape[1], picture.shape[0])
     return cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _aligned(picture: np.ndarray, shift: tuple[float, float] | None) -> np.ndarray:
+    """A live picture without the camera's shift, where one was measured."""
+    return picture if shift is None else _moved(picture, (-shift[0], -shift[1]))
 
 
 def _inner(mask: np.ndarray, shift_px: float) -> np.ndarray:

@@ -122,6 +122,18 @@ def test_a_plan_is_run_blind_and_resumed_and_its_log_is_a_study(made, tmp_path):
     assert len(results.recovery.arms) == 2
 
 
+def test_the_labs_record_of_a_point_is_that_of_its_frame(made):
+    """Replaying the recorded actions brings the puck exactly to where the point says that it was."""
+    from lerobot_roborecover.robot.points import read_points
+
+    with lab(made) as robot:
+        for point in read_points(made / "points").points:
+            robot.new_scene(robot.config.seed + point.episode)
+            for action in point.scenario.prefix:
+                robot.send_action(dict(zip(robot.action_features, action.tolist(), strict=True)))
+            assert robot.world.distance_m(dict(point.truth["objects"])) < 1e-9
+
+
 def test_a_changed_plan_and_a_second_console_are_refused(made, tmp_path):
     lock_plan(plan_of(made), tmp_path)
     with pytest.raises(OptionError, match="the plan was locked when the run began; its plan changed"):

@@ -57,6 +57,19 @@ def test_a_displaced_object_is_measured_and_the_camera_is_not_blamed(offset_mm):
     assert found.object_px * MM_PER_PX == pytest.approx(np.hypot(*offset_mm), abs=3.5)
 
 
+@pytest.mark.parametrize("offset_mm", [(0.0, 0.0), (3.0, 0.0), (0.0, -12.0), (-8.0, 6.0)])
+def test_an_object_half_behind_the_arm_is_measured_without_the_arm(offset_mm):
+    camera, away = TableCamera(96, 1.0), (0.95, 0.95)
+    puck = HAND + np.array([0.01, -0.1])
+    hands = np.linspace((0.0, -0.35), HAND, 8)
+    frames = np.stack([seen(camera, (-0.1, 0.2) if i < 6 else puck, hand) for i, hand in enumerate(hands)])
+    (box,) = camera.box(HAND, puck)
+    reference = Reference.of(frames).with_boxes([tuple(box)])
+    cleared = reference.with_cleared(seen(camera, away, (0.0, -0.35)), seen(camera, away))
+    live = seen(camera, puck + np.array(offset_mm) / 1000)
+    assert compare(cleared, live).object_px * MM_PER_PX == pytest.approx(np.hypot(*offset_mm), abs=4.0)
+
+
 def test_both_at_once_are_told_apart():
     camera = TableCamera(96, 1.0)
     reference = boxed(Reference.of(episode(camera)))

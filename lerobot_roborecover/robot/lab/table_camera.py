@@ -40,20 +40,32 @@ class TableCamera:
             hand_m: (2,) position of the hand.
             puck_m: (2,) position of the puck.
         """
-        scene = _table(self._tags).copy()
-        _disc(scene, puck_m, PUCK_RADIUS_M, PUCK_RGB)
-        if self._tags:
-            _tag(scene, puck_m, 0)
-        # The arm comes from the edge of the table at the robot's side.
-        cv2.line(scene, _pixel((hand_m[0] * 0.3, -0.98)), _pixel(hand_m), (70, 70, 78), 22, cv2.LINE_AA)
-        _disc(scene, hand_m, 0.035, HAND_RGB)
         scale, offset = self._view(hand_m)
-        matrix = np.array([[scale, 0.0, offset[0]], [0.0, scale, offset[1]]])
-        if scale < 1:  # without it, thin structure flickers from pixel to pixel
-            scene = cv2.GaussianBlur(scene, (0, 0), 0.4 / scale)
+        blur = 0.4 / scale if scale < 1 else 0.0  # without it, thin structure flickers from pixel to pixel
+        left, top, right, bottom = self._seen(scale, offset, margin=4 * blur + 3)
+        scene = _table(self._tags)[top:bottom, left:right].copy()
+        corner = np.array([left, top])
+        _disc(scene, corner, puck_m, PUCK_RADIUS_M, PUCK_RGB)
+        if self._tags:
+            _tag(scene, corner, puck_m, 0)
+        # The arm comes from the edge of the table at the robot's side.
+        base, hand = (np.array(_pixel(end)) - corner for end in ((hand_m[0] * 0.3, -0.98), hand_m))
+        cv2.line(scene, base.tolist(), hand.tolist(), (70, 70, 78), 22, cv2.LINE_AA)
+        _disc(scene, corner, hand_m, 0.035, HAND_RGB)
+        matrix = np.array([[scale, 0.0, offset[0] + scale * left], [0.0, scale, offset[1] + scale * top]])
+        if blur:
+            scene = cv2.GaussianBlur(scene, (0, 0), blur)
         return cv2.warpAffine(
             scene, matrix, (self._size, self._size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
+
+    def _seen(self, scale: float, offset: np.ndarray, margin: float) -> tuple[int, int, int, int]:
+        """Left, top, right and bottom of the part of the drawn table that the picture shows, and a margin."""
+        ends = (np.array([[0.0], [self._size - 1.0]]) - offset) / scale
+        side = round(_SIDE_M * PX_PER_M)
+        low = np.clip(np.floor(ends[0] - margin), 0, side - 1).astype(int)
+        high = np.clip(np.ceil(ends[1] + margin), low + 1, side).astype(int)
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
     def box(self, hand_m: np.ndarray, puck_m: np.ndarray) -> list[list[int]]:
         """Left, top, width and height in pixels around the puck; none where it is not in the picture.
@@ -83,9 +95,13 @@ def _pixel(point_m: tuple[float, float] | np.ndarray) -> tuple[int, int]:
     return round((x + _SIDE_M / 2) * PX_PER_M), round((_SIDE_M / 2 - y) * PX_PER_M)
 
 
-def _disc(scene: np.ndarray, place_m: np.ndarray, radius_m: float, rgb: tuple[int, int, int]) -> None:
+def _disc(
+    scene: np.ndarray, corner: np.ndarray, place_m: np.ndarray, radius_m: float, rgb: tuple[int, int, int]
+) -> None:
+    """Draws a disc into a part of the table whose upper left pixel is `corner`."""
     fine = 4  # sub-pixel places: a round number of pixels would hide small errors
-    x, y = (place_m[0] + _SIDE_M / 2) * PX_PER_M, (_SIDE_M / 2 - place_m[1]) * PX_PER_M
+    x = (place_m[0] + _SIDE_M / 2) * PX_PER_M - corner[0]
+    y = (_SIDE_M / 2 - place_m[1]) * PX_PER_M - corner[1]
     centre = (round(x * 2**fine), round(y * 2**fine))
     cv2.circle(scene, centre, round(radius_m * PX_PER_M * 2**fine), rgb, -1, cv2.LINE_AA, fine)
 
@@ -108,17 +124,19 @@ def _table(tags: bool) -> np.ndarray:
     for goal in GOALS_M:
         cv2.circle(scene, _pixel(goal), round(0.1 * PX_PER_M), GOAL_RGB, 5, cv2.LINE_AA)
     if tags:
-        _tag(scene, np.array(_TABLE_TAG_M), 1)
+        _tag(scene, np.zeros(2, int), np.array(_TABLE_TAG_M), 1)
     return scene
 
 
-def _tag(scene: np.ndarray, place_m: np.ndarray, number: int) -> None:
-    """Draws an ArUco tag (4x4_50) with its white border, centred on a place."""
+def _tag(scene: np.ndarray, corner: np.ndarray, place_m: np.ndarray, number: int) -> None:
+    """Draws an ArUco tag (4x4_50) with its white border, centred on a place, as far as it is in the scene."""
     side = round(TAG_SIDE_M * PX_PER_M)
     marker = cv2.aruco.generateImageMarker(
         cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), number, side
     )
     bordered = cv2.copyMakeBorder(marker, 6, 6, 6, 6, cv2.BORDER_CONSTANT, value=255)
-    column, row = _pixel(place_m)
+    column, row = np.array(_pixel(place_m)) - corner
     top, left = row - bordered.shape[0] // 2, column - bordered.shape[1] // 2
-    scene[top : top + bordered.shape[0], left : left + bordered.shape[1]] = bordered[..., None]
+    inside = bordered[max(-top, 0) :, max(-left, 0) :]
+    place = scene[max(top, 0) : max(top + len(bordered), 0), max(left, 0) : max(left + len(bordered), 0)]
+    place[:] = inside[: place.shape[0], : place.shape[1], None]
