@@ -7,7 +7,9 @@ from pathlib import Path
 
 from lerobot_roborecover.utils.options import option
 
-HELP = "Write an EnvHub repository (env.py and a card) that offers a scenario set as an environment."
+HELP = (
+    "Write an EnvHub repository (env.py, requirements, a card) that offers a scenario set as an environment."
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,6 +55,7 @@ COMMANDS = (
     Command("dataset publish", "publish", "Publish a dataset on the Hub, with its card and tags.", "publish"),
     Command("dataset render", "render", "Render every prefix as an episode of a LeRobotDataset.", "render"),
     Command("dataset repair", "repair", "Rebuild the metadata after LeRobot's tools.", "repair"),
+    Command("dataset certify", "certify", "Replay every scenario; certify what is exact."),
     Command("dataset envhub", "envhub", "Write an EnvHub repository that offers a set.", "envhub"),
     Command("curate build", "build", "Build a scenario dataset from one YAML file.", "build"),
     Command("curate collect", "collect", "Roll out a policy or an expert; keep its failures.", "collect"),

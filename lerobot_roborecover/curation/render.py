@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.funnel import DECISIONS_FILE, carry_decisions
+from lerobot_roborecover.datasets.certificate import CERTIFICATE_FILE
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.render import check_rendering, forget_shards, render_dataset
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
@@ -88,7 +89,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
         )
         carry_decisions(request.dataset, folder)
         for path in sorted((request.dataset / FOLDER).glob("*.json")):
-            if path.name not in (MANIFEST_FILE, DECISIONS_FILE):
+            if path.name not in (MANIFEST_FILE, DECISIONS_FILE, CERTIFICATE_FILE):
                 shutil.copyfile(path, folder / FOLDER / path.name)
     forget_shards(work)
     return len(scenarios)

@@ -18,6 +18,7 @@ from lerobot_roborecover.datasets.benchmark import (
     viewer_config,
     viewer_tables,
 )
+from lerobot_roborecover.datasets.certificate import fresh_certificate
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, FrameStore
 from lerobot_roborecover.datasets.licenses import license_metadata
 from lerobot_roborecover.datasets.pictures import grid_png, spread, stored_frame
@@ -70,7 +71,7 @@ def make_card(
         frames: (H, W, 3) uint8 by scenario id, for the grid instead of what the dataset holds.
 
     Raises:
-        ScenarioError: the dataset is not valid, or no licence is given.
+        ScenarioError: the dataset is not valid, its certificate is stale, or no licence is given.
     """
     common = {"repo_id": repo_id, "version": version, "tag": tag, "title": title or repo_id.split("/")[-1]}
     if (root / FOLDER / TRAJECTORIES_FILE).is_file():
@@ -128,6 +129,7 @@ def _scenario_card(
         ],
         cells=_cell_table(scenarios),
         steps=_step_summary(scenarios),
+        certificate=fresh_certificate(root),
         fingerprinted=sum(s.fingerprint is not None for s in scenarios),
         clusters=len({s.cluster for s in scenarios if s.cluster}),
         total=len(scenarios),

@@ -7,19 +7,17 @@ neither LeRobot nor torch.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.platforms import SimulatorError, platform_named
+from lerobot_roborecover.datasets.replay_log import ReplayItem, deciding_versions, replay_logged
+from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.platforms.versions import installed
 from lerobot_roborecover.replay.handoff import record_handoff
 from lerobot_roborecover.scenario import Fingerprint, Pose, Scenario, ScenarioError
-from lerobot_roborecover.utils.journal import AppendOnly, InUseError
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
@@ -28,6 +26,7 @@ type ResetCheck = Callable[[Simulator, Scenario], dict[str, float]]
 beyond what may be."""
 
 _SCENARIOS_PER_JOB = 8
+"""A simulator is kept from job to job."""
 
 
 @dataclass(frozen=True)
@@ -76,29 +75,17 @@ def fingerprint_scenarios(
         return []
     platform = scenarios[0].platform
     options = dict(options or {}) if pool is None else pool.options
-    versions = _versions(platform, options)
-    keys = [hashlib.sha256(f"{s.sha256()} {versions}".encode()).hexdigest() for s in scenarios]
-    file, done = _open_log(log)
-    open_rows = [i for i, key in enumerate(keys) if key not in done]
-    found: dict[int, Replayed] = {}
-    for i, key in enumerate(keys):
-        if key in done:
-            found[i] = _apply(scenarios[i], done[key])
-    progress(len(found), len(scenarios))
-    jobs = _jobs(scenarios, open_rows)
+    versions = deciding_versions(platform, options)
+    items = [
+        ReplayItem(s, hashlib.sha256(f"{s.sha256()} {versions}".encode()).hexdigest()) for s in scenarios
+    ]
     used = nullcontext(pool) if pool else JobPool(platform, options, workers, workplace=workplace)
-    with file, used as processes:
-
-        def keep(i: int, entry: dict[str, Any]) -> None:
-            found[i] = _apply(scenarios[i], entry)
-            if not found[i].error:
-                file.append(json.dumps({"key": keys[i], **entry}).encode())
-            progress(len(found), len(scenarios))
-
-        for rows, entries in processes.run(_replay, jobs, lambda rows: ([scenarios[i] for i in rows], check)):
-            for i, entry in zip(rows, entries, strict=True):
-                keep(i, entry)
-    return [found[i] for i in range(len(scenarios))]
+    with used as processes:
+        entries = replay_logged(
+            items, log, processes, _replay, lambda part: (part, check),
+            per_job=_SCENARIOS_PER_JOB, progress=progress,
+        )  # fmt: skip
+    return [_apply(item.scenario, entry) for item, entry in zip(items, entries, strict=True)]
 
 
 def _replay(scenarios: Sequence[Scenario], check: ResetCheck | None) -> list[dict[str, Any]]:
@@ -119,9 +106,9 @@ def _replay(scenarios: Sequence[Scenario], check: ResetCheck | None) -> list[dic
             {
                 "id": scenario.id,
                 "deviations": deviations,
-                "fixtures": _pose_lists(reset.fixtures),
+                "fixtures": pose_lists(reset.fixtures),
                 "step": mark.step,
-                "bodies": _pose_lists(mark.bodies),
+                "bodies": pose_lists(mark.bodies),
                 "state_sha256": mark.state_sha256,
                 "versions": dict(mark.versions),
             }
@@ -132,56 +119,16 @@ def _replay(scenarios: Sequence[Scenario], check: ResetCheck | None) -> list[dic
 def _apply(scenario: Scenario, entry: Mapping[str, Any]) -> Replayed:
     if "error" in entry:
         return Replayed(scenario, {}, entry["error"])
-    mark = Fingerprint(entry["step"], _poses(entry["bodies"]), entry["state_sha256"], entry["versions"])
-    reset = replace(scenario.reset, fixtures=_poses(entry["fixtures"]))
+    mark = Fingerprint(entry["step"], poses_of(entry["bodies"]), entry["state_sha256"], entry["versions"])
+    reset = replace(scenario.reset, fixtures=poses_of(entry["fixtures"]))
     return Replayed(replace(scenario, reset=reset, fingerprint=mark), entry["deviations"])
 
 
-def _pose_lists(poses: Mapping[str, Pose]) -> dict[str, list[float]]:
+def pose_lists(poses: Mapping[str, Pose]) -> dict[str, list[float]]:
+    """Poses as JSON values: position, metres, and quat_xyzw."""
     return {name: [*p.position_m, *p.quat_xyzw] for name, p in poses.items()}
 
 
-def _poses(lists: Mapping[str, Sequence[float]]) -> dict[str, Pose]:
+def poses_of(lists: Mapping[str, Sequence[float]]) -> dict[str, Pose]:
+    """The poses of `pose_lists`."""
     return {name: Pose.of(p) for name, p in lists.items()}
-
-
-def _jobs(scenarios: Sequence[Scenario], rows: Sequence[int]) -> list[list[int]]:
-    """Rows in small groups of one task each, because a simulator compiles each task once."""
-    by_task: dict[tuple[str, str], list[int]] = {}
-    for i in rows:
-        by_task.setdefault((scenarios[i].task.suite, scenarios[i].task.name), []).append(i)
-    return [
-        group[i : i + _SCENARIOS_PER_JOB]
-        for group in by_task.values()
-        for i in range(0, len(group), _SCENARIOS_PER_JOB)
-    ]
-
-
-def _versions(platform: str, options: Mapping[str, Any]) -> str:
-    found = platform_named(platform)
-    versions = {name: installed(name) for name in found.required_versions}
-    return json.dumps([versions, found.environment_fingerprint(options)])
-
-
-def _open_log(log: Path) -> tuple[AppendOnly, dict[str, dict[str, Any]]]:
-    """The log, and finished scenarios by key; a last line that a crash cut short goes.
-
-    Raises:
-        ScenarioError: it is damaged, cannot be written, or another process has it open.
-    """
-    try:
-        file = AppendOnly(log)
-    except OSError as err:
-        raise ScenarioError(f"{log} cannot be written: {err}. Name another working folder") from err
-    except InUseError as err:
-        raise ScenarioError(f"{err}; stop that one first, or name another working folder") from None
-    found = {}
-    for number, line in enumerate(file.lines(), 1):
-        try:
-            entry = json.loads(line)
-            found[entry["key"]] = entry
-        except (ValueError, KeyError, TypeError):
-            file.close()
-            raise ScenarioError(f"{log}, line {number} is damaged; delete the file to start again") from None
-    file.cut()
-    return file, found

@@ -18,6 +18,7 @@ from huggingface_hub.errors import (
 )
 from huggingface_hub.hf_api import RepoFile
 
+from lerobot_roborecover.datasets.certificate import CERTIFICATE_FILE, MAX_CERTIFICATE_BYTES
 from lerobot_roborecover.datasets.schema import (
     FOLDER,
     MANIFEST_FILE,
@@ -30,6 +31,8 @@ from lerobot_roborecover.scenario import ScenarioError
 logger = logging.getLogger(__name__)
 
 _LIMITS = {f"{FOLDER}/{MANIFEST_FILE}": MAX_MANIFEST_BYTES, f"{FOLDER}/{SCENARIOS_FILE}": MAX_PARQUET_BYTES}
+_CERTIFICATE = f"{FOLDER}/{CERTIFICATE_FILE}"
+"""Pulled where there is one."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -88,12 +91,15 @@ def pull(repo_id: str, revision: str | None) -> tuple[Path, str]:
 
 
 def _download(where: str, repo_id: str, revision: str | None) -> Path:
-    """Checks the sizes the Hub gives, then downloads the two files."""
+    """Checks the sizes the Hub gives, then downloads the two files, and the certificate."""
+    names = [*_LIMITS, _CERTIFICATE]
     sizes = {
         info.path: info.size
-        for info in HfApi().get_paths_info(repo_id, list(_LIMITS), repo_type="dataset", revision=revision)
+        for info in HfApi().get_paths_info(repo_id, names, repo_type="dataset", revision=revision)
         if isinstance(info, RepoFile)
     }
+    if sizes.get(_CERTIFICATE, 0) > MAX_CERTIFICATE_BYTES:
+        names.remove(_CERTIFICATE)
     for path, limit in _LIMITS.items():
         if path not in sizes:
             raise ScenarioError(
@@ -102,9 +108,7 @@ def _download(where: str, repo_id: str, revision: str | None) -> Path:
             )
         if sizes[path] > limit:
             raise ScenarioError(f"{where}: {path} has {sizes[path]} bytes; the limit is {limit}")
-    return Path(
-        snapshot_download(repo_id, repo_type="dataset", revision=revision, allow_patterns=list(_LIMITS))
-    )
+    return Path(snapshot_download(repo_id, repo_type="dataset", revision=revision, allow_patterns=names))
 
 
 def cached_folder(repo_id: str, revision: str | None) -> Path | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_roborecover.datasets.certificate import describe_certificate
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER
 from lerobot_roborecover.datasets.load import ScenarioSet
 from lerobot_roborecover.datasets.schema import package_versions
@@ -53,6 +54,8 @@ def summary(found: ScenarioSet) -> str:
         f"{lengths.mean():.1f}",
         f"{sum(s.fingerprint is not None for s in scenarios)} with a handoff fingerprint",
     ]
+    if found.root is not None:
+        lines.append(f"certificate: {describe_certificate(found.root)}")
     kept = [n for n in found.manifest["files"] if n.startswith(f"{FRAMES_FOLDER}/")]
     if kept:
         lines.append(f"last frames before the handoff, in {len(kept)} of the files")

@@ -37,6 +37,8 @@ class ScenarioSet(Sequence[Scenario]):
     """The Hub commit that was read; None for a folder or a built-in set."""
     manifest: Mapping[str, Any]
     """`meta/roborecover/manifest.json` of the whole dataset, before any selection."""
+    root: Path | None = None
+    """Folder that was read; None for scenarios that were never in one."""
 
     def __post_init__(self):
         object.__setattr__(self, "scenarios", tuple(self.scenarios))
@@ -127,7 +129,7 @@ def load_scenarios(
     text = os.fspath(source)
     root, commit = _locate(source, revision or None)
     scenarios, manifest = read_with_manifest(root)
-    found = ScenarioSet(tuple(scenarios), text, commit, manifest)
+    found = ScenarioSet(tuple(scenarios), text, commit, manifest, root)
     if split:
         splits = manifest["counts"]["split"]
         if split not in splits:

@@ -15,6 +15,7 @@ from pathlib import Path
 from huggingface_hub import HfApi, snapshot_download
 from huggingface_hub.hf_api import RepoFile
 
+from lerobot_roborecover.datasets.certificate import CERTIFICATE_FILE
 from lerobot_roborecover.datasets.contents import MAX_FILE_BYTES, check_file, check_names
 from lerobot_roborecover.datasets.retries import retry
 from lerobot_roborecover.datasets.schema import (
@@ -130,7 +131,9 @@ def _wanted(where: str, entries: Sequence[RepoFile], evaluation_only: bool) -> l
     missing = [path for path in _EVALUATION if path not in by_path]
     if missing and (evaluation_only or f"{FOLDER}/{TRAJECTORIES_FILE}" not in by_path):
         raise ScenarioError(f"{where} holds no {missing[0]}: it is not a scenario dataset. Check the id")
-    wanted = [by_path[p] for p in _EVALUATION] if evaluation_only else list(entries)
+    wanted = list(entries)
+    if evaluation_only:
+        wanted = [by_path[p] for p in (*_EVALUATION, f"{FOLDER}/{CERTIFICATE_FILE}") if p in by_path]
     check_names(where, (e.path for e in wanted))
     for entry in wanted:
         limit = _LIMITS.get(entry.path, MAX_FILE_BYTES)

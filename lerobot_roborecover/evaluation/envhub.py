@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_roborecover.errors import OptionError
 
 if TYPE_CHECKING:
+    from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
     from lerobot_roborecover.evaluation.vector_env import ScenarioVectorEnv
 
 
@@ -45,6 +46,24 @@ def make_hub_env(
         OptionError: a field is no option, or cannot be used.
         ScenarioError: the set cannot be loaded.
     """
+    return _env_config(offer, cfg).create_envs(n_envs, use_async_envs)
+
+
+def make_hub_processors(offer: HubScenarios, cfg: Any = None) -> tuple[Any, Any]:
+    """LeRobot's env preprocessor and postprocessor of the platform: a `HubEnvConfig` has none.
+
+    Args:
+        offer: the repository's scenarios.
+        cfg: as for `make_hub_env`.
+
+    Raises:
+        OptionError: a field is no option, or cannot be used.
+    """
+    return _env_config(offer, cfg).get_env_processors()
+
+
+def _env_config(offer: HubScenarios, cfg: Any) -> RecoveryEnvConfig:
+    """The recovery env config that a repository and its user's options make."""
     import draccus
 
     from lerobot_roborecover.evaluation.env_configs import env_type
@@ -54,8 +73,7 @@ def make_hub_env(
     known = {field.name for field in dataclasses.fields(kind)}
     options = {k: v for k, v in dataclasses.asdict(offer).items() if k != "platform" and v is not None}
     options |= _options_of(cfg, known)
-    config = draccus.decode(kind, {**platform_named(offer.platform).env_defaults, **options})
-    return config.create_envs(n_envs, use_async_envs)
+    return draccus.decode(kind, {**platform_named(offer.platform).env_defaults, **options})
 
 
 def _options_of(cfg: Any, known: set[str]) -> dict[str, Any]:

@@ -1,16 +1,18 @@
-"""Writes the files of an EnvHub repository: `env.py`, which runs, and a card."""
+"""Writes the files of an EnvHub repository: `env.py`, which runs, its requirements, and a card."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.datasets.card import render_card, render_text
 from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet, builtin_names
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.envhub import HubScenarios
-from lerobot_roborecover.platforms import platform_named
+from lerobot_roborecover.platforms import Platform, platform_named
 from lerobot_roborecover.platforms.registry import env_type_of
+from lerobot_roborecover.platforms.versions import installed
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.outputs import check_page
 
@@ -57,8 +59,22 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         env_type=env_type_of(platform.env_name or platform.name),
         **values,
     )
-    texts = {"env.py": render_text("env.py.j2", **values), "README.md": card}
+    texts = {
+        "env.py": render_text("env.py.j2", **values),
+        "README.md": card,
+        "requirements.txt": _requirements(platform),
+    }
     check_page(out, list(texts), lambda page: _MADE_HERE.search(page.read_bytes()) is not None)
     for name, text in texts.items():
         atomic_write(out / name, text)
     return [out / name for name in texts]
+
+
+def _requirements(platform: Platform) -> str:
+    """This package, and the platform's own where another distribution brings it, at the versions in use."""
+    extra = f"[{platform.extra}]" if platform.extra else ""
+    ours = Platform.distribution
+    if platform.distribution == ours:
+        return f"{ours}{extra}=={__version__}\n"
+    version = installed(platform.distribution)
+    return f"{ours}=={__version__}\n{platform.distribution}{extra}" + (f"=={version}\n" if version else "\n")

@@ -216,6 +216,14 @@ def _compare(handoff: Handoff, bodies: Mapping[str, Pose], fingerprint: Fingerpr
     return handoff
 
 
+def with_fixtures(simulator: Simulator, scenario: Scenario) -> Scenario:
+    """Adds fixture poses to a scenario's reset, where the platform draws them and the reset lacks them."""
+    if scenario.reset.fixtures:
+        return scenario
+    simulator.reset(scenario.task, scenario.reset)
+    return replace(scenario, reset=replace(scenario.reset, fixtures=dict(simulator.fixtures())))
+
+
 def with_fingerprint(
     simulator: Simulator, scenario: Scenario, frames_png: tuple[bytes, ...] = ()
 ) -> Scenario:
@@ -237,10 +245,7 @@ def record_handoff(
     Raises:
         ScenarioError: the prefix already solves the task, so that there is nothing to recover.
     """
-    if not scenario.reset.fixtures:
-        simulator.reset(scenario.task, scenario.reset)
-        scenario = replace(scenario, reset=replace(scenario.reset, fixtures=dict(simulator.fixtures())))
-    scenario = replace(scenario, fingerprint=None)
+    scenario = replace(with_fixtures(simulator, scenario), fingerprint=None)
     handoff = hand_off(simulator, scenario, check=False)
     if handoff.problem is Outcome.SOLVED_BY_PREFIX:
         raise ScenarioError(f"scenario {scenario.id}: {handoff.reason}; there is nothing to recover from")

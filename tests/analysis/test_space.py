@@ -54,6 +54,7 @@ def test_the_files_of_a_space(space):
     front = yaml.safe_load((out / "README.md").read_text().split("---\n")[1])
     assert (front["sdk"], front["app_file"], front["title"]) == ("static", "index.html", "Our board")
     assert front["datasets"] == ["nobody/has"]
+    assert sum("Certificate of the set: " in p.read_text() for p in out.glob("scenarios-*.html")) == 1
     assert {p.name for p in out.glob("*.html")} == {"index.html", "scenarios-1.html", "scenarios-2.html"}
     assert (out / "media" / "0-me-alpha-1" / f"{scenarios[0].id}.mp4").is_file()
     assert any("nobody/has: no pictures: " in r or "nobody/has@r1, test: no pictures: " in r for r in remarks)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.curation import exactness
 from lerobot_roborecover.curation.funnel import Decision, read_decisions, record_decisions
 from lerobot_roborecover.curation.split_dataset import SPLIT_FILE
-from lerobot_roborecover.curation.validate import states
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import last_frames
@@ -26,7 +26,7 @@ def without_hash(scenario, **changes):
 @pytest.fixture
 def bare(tmp_path):
     """A divided set with decisions, labels and frames, whose scenarios have no hash, one no fingerprint."""
-    found = [without_hash(fake_scenario(i)) for i in range(4)]
+    found = [without_hash(fake_scenario(i, name="push-left")) for i in range(4)]
     found[1] = replace(found[1], split="train", cluster="c", provenance={"votes": [1, 2]})
     found[3] = replace(found[3], fingerprint=None)
     frames = [last_frames(make_simulator("fake", obs_type="pixels_agent_pos"), s) for s in found[:3]]
@@ -42,7 +42,7 @@ def test_only_the_hash_is_new(bare, tmp_path, capsys):
     assert "4 states, each replayed twice and identical; 4 had no hash" in capsys.readouterr().out
     before, after = read_scenarios(bare), read_scenarios(tmp_path / "out")
     for i, (old, new) in enumerate(zip(before, after, strict=True)):
-        exact = fake_scenario(i).fingerprint
+        exact = fake_scenario(i, name="push-left").fingerprint
         assert new.fingerprint.state_sha256 == exact.state_sha256
         assert new.fingerprint.bodies == exact.bodies
         assert new.sha256() == old.sha256()
@@ -70,7 +70,7 @@ def elsewhere(scenario):
     ],
 )
 def test_one_that_does_not_fit_writes_nothing(tmp_path, capsys, change, message):
-    good, bad = without_hash(fake_scenario(0)), change(fake_scenario(1, steps=30))
+    good, bad = without_hash(fake_scenario(0)), change(fake_scenario(1, name="push-left", steps=30))
     write_scenarios(tmp_path / "set", [good, bad])
     assert main(["validate", str(tmp_path / "set"), "--states", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
@@ -82,15 +82,13 @@ def test_one_that_does_not_fit_writes_nothing(tmp_path, capsys, change, message)
 
 def test_two_replays_that_differ_write_nothing(tmp_path, monkeypatch, capsys):
     write_scenarios(tmp_path / "set", [without_hash(fake_scenario(0))])
-    turns = iter("ab")
-    real = states.fingerprint_scenarios
+    real = exactness.replay_logged
 
     def other_state(*args, **kwargs):
-        (found,) = real(*args, **kwargs)
-        mark = replace(found.scenario.fingerprint, state_sha256=next(turns) * 64)
-        return [replace(found, scenario=replace(found.scenario, fingerprint=mark))]
+        first, second = real(*args, **kwargs)
+        return [first, {**second, "replay": {**second["replay"], "state_sha256": "b" * 64}}]
 
-    monkeypatch.setattr(states, "fingerprint_scenarios", other_state)
+    monkeypatch.setattr(exactness, "replay_logged", other_state)
     assert main(["validate", str(tmp_path / "set"), "--states", "--out", str(tmp_path / "out")]) == 2
     assert "two replays reach different states" in capsys.readouterr().err
 

@@ -64,7 +64,8 @@ def publish(hub, root: Path, **settings) -> str:
     return hub.repos[REPO].commit(files)
 
 
-def test_push_then_load_at_tag_and_commit_pulls_only_the_scenarios(hub, client, local):
+def test_push_then_load_at_tag_and_commit_pulls_only_scenarios_and_certificate(hub, client, local):
+    (local / FOLDER / "certificate.json").write_text("{}")
     pushed = client.run(PUSH, REPO, str(local), token=TOKEN)
     assert pushed.returncode == 0, pushed.stderr
     commit = pushed.stdout.split()[-1]
@@ -75,7 +76,7 @@ def test_push_then_load_at_tag_and_commit_pulls_only_the_scenarios(hub, client, 
         assert found["revision"] == commit
         assert found["sha256"] == expected
     fetched = {p.split("/resolve/")[1].split("/", 1)[1] for _, p in hub.log if "/resolve/" in p}
-    assert fetched == FILES
+    assert fetched == {*FILES, f"{FOLDER}/certificate.json"}
     assert (
         hub.repos[REPO].commits[commit][f"{FOLDER}/scenarios.parquet"]
         == (local / FOLDER / "scenarios.parquet").read_bytes()

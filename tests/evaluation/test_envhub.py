@@ -7,6 +7,7 @@ import runpy
 
 import pytest
 
+from lerobot_roborecover._version import __version__
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.platforms import platform_named
 from tests.support.factories import fake_dataset
@@ -61,12 +62,17 @@ def test_lerobot_makes_the_environment_of_a_repository_on_the_hub(hub, client, t
 
 @pytest.mark.lerobot
 def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
+    from lerobot.processor import PolicyProcessorPipeline
+
     common = ["--repo-id", "lab/env", "--out", str(tmp_path / "env")]
     assert main(["envhub", "metaworld_starter", *common]) == 0
     make_env = runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env"]
     card = (tmp_path / "env" / "README.md").read_text()
     assert "--env.type=roborecover_metaworld --env.scenarios=metaworld_starter" in card
     assert callable(make_env)
+    assert (tmp_path / "env" / "requirements.txt").read_text() == f"lerobot_env_roborecover=={__version__}\n"
+    before, after = runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env_processors"]()
+    assert (type(before), type(after)) == (PolicyProcessorPipeline, PolicyProcessorPipeline)
     capsys.readouterr()
     folder = fake_dataset(tmp_path / "set", 2)
     assert main(["envhub", str(folder), *common]) == 2

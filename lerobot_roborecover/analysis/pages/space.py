@@ -15,10 +15,10 @@ from lerobot_roborecover.analysis.pages.leaderboard import BoardGallery, write_l
 from lerobot_roborecover.analysis.pages.media import find_media
 from lerobot_roborecover.analysis.pages.page import render_page
 from lerobot_roborecover.analysis.stats.panel import Panel
-from lerobot_roborecover.datasets.load import HUB_ID
+from lerobot_roborecover.datasets.certificate import describe_certificate
+from lerobot_roborecover.datasets.load import HUB_ID, ScenarioSet
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.logs.row import TrialRow
-from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.atomic_io import atomic_file, atomic_write
 from lerobot_roborecover.utils.outputs import claim_page
 
@@ -57,7 +57,7 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
     with claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages]):
         galleries = []
         for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
-            frames, problems = _frames(board, trials, out, config.render)
+            frames, certificate, problems = _frames(board, trials, out, config.render)
             clips = _media(config.media, trials.recovery, out)
             cards = make_cards(
                 trials.recovery, frames, clips, trials.initial, action_folders=config.action_folders
@@ -69,6 +69,7 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
                 scripts=("gallery.js", "trial.js"),
                 with_files=True,
                 board=board,
+                certificate=certificate,
                 **gallery_values(cards),
             )
             atomic_write(out / name, page)
@@ -87,13 +88,15 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
 
 def _frames(
     board: Board, trials: BoardTrials, out: Path, render: bool
-) -> tuple[dict[str, bytes | str], list[str]]:
-    """Paths of recovery frames from the page, by scenario id, and what is missing."""
+) -> tuple[dict[str, bytes | str], str, list[str]]:
+    """Paths of recovery frames from the page, by scenario id; the set's certificate; and what is missing."""
     wanted = {s.id for s in trials.recovery.scenarios}
     try:
-        chosen = [s for s in _scenarios(board, trials.recovery.rows.values()) if s.id in wanted]
+        found = _scenarios(board, trials.recovery.rows.values())
     except RoboRecoverError as err:
-        return {}, [f"no pictures: {err}"]
+        return {}, "", [f"no pictures: {err}"]
+    chosen = [s for s in found if s.id in wanted]
+    certificate = describe_certificate(found.root) if found.root else ""
     files: dict[str, bytes | str] = {}
     folder = f"frames/{board.scenario_set}"
     for scenario in chosen:
@@ -103,23 +106,23 @@ def _frames(
             files[scenario.id] = path
     todo = [s for s in chosen if s.id not in files]
     if not todo:
-        return files, []
+        return files, certificate, []
     if not render:
-        return files, [f"{len(todo)} scenarios have no picture in the set; --render makes them"]
+        return files, certificate, [f"{len(todo)} scenarios have no picture in the set; --render makes them"]
     from lerobot_roborecover.analysis.pages.pictures import render_frames
 
     made, problem = render_frames(todo, out / folder)
     files |= {scenario_id: f"{folder}/{path.name}" for scenario_id, path in made.items()}
-    return files, [f"pictures are missing: {problem}"] if problem else []
+    return files, certificate, [f"pictures are missing: {problem}"] if problem else []
 
 
-def _scenarios(board: Board, rows: Iterable[Sequence[TrialRow]]) -> list[Scenario]:
+def _scenarios(board: Board, rows: Iterable[Sequence[TrialRow]]) -> ScenarioSet:
     """The board's scenario set, which must be what the trials were made on."""
     from lerobot_roborecover.datasets import load_scenarios
 
     first = board.entries[0].provenance
-    found = list(load_scenarios(first.dataset, revision=first.dataset_revision))
-    check_scenarios((row for trials in rows for row in trials), found, first.dataset)
+    found = load_scenarios(first.dataset, revision=first.dataset_revision)
+    check_scenarios((row for trials in rows for row in trials), list(found), first.dataset)
     return found
 
 

@@ -2,22 +2,24 @@
 
 Sets that were validated before `validate` wrote the replayed state's hash lack it, and so do scenarios from
 elsewhere: their handoffs can be told to be within 2 mm, but not to be identical. Every prefix is replayed
-twice, the second time by other processes and in the opposite order.
+twice, the second time by other processes and in the opposite order (`curation.exactness`).
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lerobot_roborecover.curation.exactness import Exactness, check_exactness
+from lerobot_roborecover.datasets.certificate import CERTIFICATE_FILE
 from lerobot_roborecover.datasets.contents import list_files
-from lerobot_roborecover.datasets.fingerprint import Replayed, fingerprint_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
+from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.write import write_scenarios
-from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Fingerprint, Scenario, ScenarioError
+from lerobot_roborecover.scenario import Fingerprint, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.workers.backend import LOCAL, Backend
@@ -63,31 +65,22 @@ def write_states(
     workplace.check()
     scenarios, manifest = read_with_manifest(root)
     with TemporaryFolder("states") as work:
-
-        def replay(order: Sequence[Scenario], turn: int) -> list[Replayed]:
-            return fingerprint_scenarios(
-                order, work / f"{turn}.jsonl", options={"obs_type": "state"}, workers=workers,
-                workplace=workplace,
-                progress=lambda done, total: progress(turn * total + done, 2 * total),
-            )  # fmt: skip
-
-        first, second = replay(scenarios, 0), replay(scenarios[::-1], 1)[::-1]
-    marked, problems, distances = [], [], [0.0]
-    for scenario, one, other in zip(scenarios, first, second, strict=True):
-        problem, distance_mm = _compared(scenario, one, other)
-        distances.append(distance_mm)
-        if problem:
-            problems.append(f"scenario {scenario.id}: {problem}")
-        elif (mark := one.scenario.fingerprint) is not None:
-            marked.append(replace(scenario, fingerprint=_marked(scenario.fingerprint, mark)))
+        found = check_exactness(
+            scenarios, work / "replays.jsonl", options={"obs_type": "state"}, workers=workers,
+            workplace=workplace, progress=progress,
+        )  # fmt: skip
+    problems = [f"scenario {one.scenario.id}: {one.fault}" for one in found if one.fault]
     if problems:
         raise ScenarioError(
             f"{root}: {len(problems)} of {len(scenarios)} scenarios get no hash, so nothing is written. "
             + "; ".join(problems[:_SHOWN])
         )
+    marked = [replace(one.scenario, fingerprint=_marked(one)) for one in found]
     frames = FrameStore(root)
     with atomic_dir(out) as folder:
         for name in list_files(root):
+            if name == f"{FOLDER}/{CERTIFICATE_FILE}":
+                continue  # of the set without these hashes
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(root / name, folder / name)
         write_scenarios(
@@ -98,37 +91,12 @@ def write_states(
             frames=(frames.of(s) for s in marked if s.id in frames),
         )
     filled = sum(not (s.fingerprint and s.fingerprint.state_sha256) for s in scenarios)
-    return StatesReport(len(scenarios), filled, max(distances))
+    return StatesReport(len(scenarios), filled, max((one.error_mm or 0.0 for one in found), default=0.0))
 
 
-def _marked(recorded: Fingerprint | None, replayed: Fingerprint) -> Fingerprint:
+def _marked(found: Exactness) -> Fingerprint:
+    """What was recorded, with the replayed state's hash and versions."""
+    replayed, recorded = found.fingerprint(), found.scenario.fingerprint
     if recorded is None:
         return replayed
     return replace(recorded, state_sha256=replayed.state_sha256, versions=replayed.versions)
-
-
-def _compared(scenario: Scenario, one: Replayed, other: Replayed) -> tuple[str, float]:
-    """What speaks against a scenario's replayed state, and how far it is from the recorded one, in mm."""
-    mark, again = one.scenario.fingerprint, other.scenario.fingerprint
-    if one.error or other.error or mark is None or again is None:
-        return f"it cannot be replayed ({one.error or other.error})", 0.0
-    if not mark.state_sha256:
-        return "its simulator gives no hash of its state", 0.0
-    if mark.state_sha256 != again.state_sha256:
-        return "two replays reach different states", 0.0
-    recorded = scenario.fingerprint
-    if recorded is None:
-        return "", 0.0
-    if recorded.state_sha256 not in ("", mark.state_sha256):
-        return "the state is not the recorded one; compare versions (roborecover doctor)", 0.0
-    missing = sorted(set(recorded.bodies) - set(mark.bodies))
-    if missing:
-        return f"the simulator has no body {missing[0]!r}, which was recorded", 0.0
-    far = max(recorded.bodies, key=lambda n: mark.bodies[n].distance_m(recorded.bodies[n]))
-    distance_m = mark.bodies[far].distance_m(recorded.bodies[far])
-    if not distance_m <= HANDOFF_TOLERANCE_M:
-        return (
-            f"{far} is {distance_m * 1e3:.2f} mm from where it was recorded; the limit is "
-            f"{HANDOFF_TOLERANCE_M * 1e3:g} mm"
-        ), distance_m * 1e3
-    return "", distance_m * 1e3
