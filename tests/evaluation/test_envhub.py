@@ -62,7 +62,7 @@ def test_lerobot_makes_the_environment_of_a_repository_on_the_hub(hub, client, t
 
 @pytest.mark.lerobot
 def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
-    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot_roborecover.evaluation.envhub import HubScenarios, make_hub_processors
 
     common = ["--repo-id", "lab/env", "--out", str(tmp_path / "env")]
     assert main(["envhub", "metaworld_starter", *common]) == 0
@@ -72,7 +72,9 @@ def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
     assert callable(make_env)
     assert (tmp_path / "env" / "requirements.txt").read_text() == f"lerobot_env_roborecover=={__version__}\n"
     before, after = runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env_processors"]()
-    assert (type(before), type(after)) == (PolicyProcessorPipeline, PolicyProcessorPipeline)
+    assert (before.steps, after.steps) == ([], []), "Meta-World needs none"
+    before, _ = make_hub_processors(HubScenarios("libero", "libero_starter"))
+    assert [type(step).__name__ for step in before.steps] == ["LiberoProcessorStep"]
     capsys.readouterr()
     folder = fake_dataset(tmp_path / "set", 2)
     assert main(["envhub", str(folder), *common]) == 2
