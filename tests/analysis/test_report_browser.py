@@ -278,6 +278,7 @@ def test_a_table_that_goes_on_says_so_and_keeps_its_first_column(page):
         page.set_viewport_size({"width": 1200, "height": 900})
 
 
+@pytest.mark.nightly
 def test_many_cards_come_by_the_page(page, report, tmp_path):
     """Counted, not timed (benchmarks/filter_speed.py times 2,000 cards)."""
     start, end = '<ul class="cards" id="cards">', "</ul>"

@@ -377,6 +377,7 @@ def whole_build(build, capsys) -> list:
     return final
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_from_rollouts_to_episodes(build, capsys):

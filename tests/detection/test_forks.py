@@ -283,6 +283,7 @@ def test_continuing_reproduces_the_rest_of_the_trial(policies, logs, kind, tmp_p
         assert row.actions_sha256 == logged.actions_sha256
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_every_arm(policies, logs, dataset, tmp_path):

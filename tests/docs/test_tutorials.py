@@ -33,13 +33,8 @@ def script(page) -> str:
 @pytest.mark.lerobot
 @pytest.mark.metaworld
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(p, id=p.stem, marks=() if p.stem == "platform" else pytest.mark.nightly)
-        for p in TUTORIALS
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("page", TUTORIALS, ids=[p.stem for p in TUTORIALS])
 def test_a_tutorial_runs(page, environment, tmp_path):  # noqa: F811
     for name in ("lerobot_roborecover", "policies", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)

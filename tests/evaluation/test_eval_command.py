@@ -211,8 +211,9 @@ def test_a_full_disk_is_one_line_and_keeps_finished_trials(run, whole, tmp_path,
     assert outcomes(rows_of(out)) == whole
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(
     run, whole, arguments, tmp_path, temporary, how
 ):
@@ -278,6 +279,7 @@ def test_videos_of_chosen_scenarios(run):
     assert all(name.startswith(chosen) for name in found)
 
 
+@pytest.mark.nightly
 def test_a_run_with_images_has_videos_of_every_start(run):
     """Without an option: the same scenarios for every policy; initial trials are kept beside the others."""
     pictures = "--env.obs_type=pixels_agent_pos"

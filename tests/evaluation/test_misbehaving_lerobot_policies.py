@@ -72,7 +72,8 @@ def bad_tensors():
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        ("act", None),
+        ("act", ("a row", "one column", "complex")),
+        pytest.param("act", None, marks=pytest.mark.nightly),
         pytest.param(
             "diffusion",
             ("a row", "one column", "an axis less", "complex", "nothing"),
