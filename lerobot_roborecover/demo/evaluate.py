@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
+from lerobot_roborecover.evaluation.arms import failure
+from lerobot_roborecover.evaluation.child import run_program
 from lerobot_roborecover.evaluation.progress import LogTail, ProgressLine, RunProgress
 from lerobot_roborecover.utils.determinism import policy_kernels
-from lerobot_roborecover.utils.text import output_end
-from lerobot_roborecover.workers.parent import ends_with_this, stop_children
-
-_POLL_S = 0.5
-_SHOWN_LINES = 12
 
 
 def eval_command(settings: DemoSettings, platform: str, ids: Sequence[str], start: str) -> list[str]:
@@ -67,43 +62,28 @@ def evaluate(settings: DemoSettings, platform: str, ids: Sequence[str], start: s
     Raises:
         DemoError: `lerobot-eval` failed, or left trials out; the message shows the end of its output.
     """
-    tail, tally = LogTail(settings.trial_log), RunProgress(start, ids, settings.trials)
+    tail, count = LogTail(settings.trial_log), RunProgress(start, ids, settings.trials)
     progress = ProgressLine(start)
-    tally.add(tail.read())
+    count.add(tail.read())
     folder = settings.out / start
-    if tally.done == tally.total and (folder / "eval_info.json").is_file():
-        progress.show(tally, final=True)
+    if count.done == count.total and (folder / "eval_info.json").is_file():
+        progress.show(count, final=True)
         return
     folder.mkdir(parents=True, exist_ok=True)
     output = folder / "lerobot-eval.log"
+    output.unlink(missing_ok=True)
     # The kernels win over the environment: the table is to be the same on every machine that has them.
-    environment = {"MUJOCO_GL": "egl", **os.environ, **policy_kernels()}
-    if Path(settings.policy).is_dir():
-        # Nothing is needed from the Hub, and a machine without network should not wait for it.
-        environment.setdefault("HF_HUB_OFFLINE", "1")
-    with open(output, "wb") as stream:
-        process = subprocess.Popen(
-            eval_command(settings, platform, ids, start),
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            # A demo that is killed must not leave a run behind that holds the trial log.
-            preexec_fn=ends_with_this(),
-        )
-        try:
-            while process.poll() is None:
-                progress.show(tally)
-                time.sleep(_POLL_S)
-                tally.add(tail.read())
-        finally:
-            stop_children([process])
-    tally.add(tail.read())
-    progress.show(tally, final=True)
-    if process.returncode != 0 or tally.done < tally.total:
-        cause, shown = output_end(output.read_text(errors="replace"), _SHOWN_LINES)
-        raise DemoError(
-            f"lerobot-eval from {start} starts ended with status {process.returncode} after {tally.done} of "
-            f"{tally.total} trials: {cause or 'it said nothing'}\nThe end of {output}:\n{shown}\n"
-            "Run the same command again to go on with what is left; 'roborecover doctor' checks this machine"
-        )
+    variables = dict(policy_kernels())
+    if not Path(settings.policy).is_dir():  # it is on the Hub
+        variables["HF_HUB_OFFLINE"] = os.environ.get("HF_HUB_OFFLINE", "0")
+
+    def watch() -> None:
+        count.add(tail.read())
+        progress.show(count)
+
+    status = run_program(eval_command(settings, platform, ids, start), variables, output, watch)
+    watch()
+    progress.show(count, final=True)
+    if status != 0 or count.done < count.total:
+        done = f" after {count.done} of {count.total} trials"
+        raise DemoError(failure(f"lerobot-eval from {start} starts", status, output, done))

@@ -47,10 +47,10 @@ def _run(settings: DemoSettings, platform: str, scenarios: Sequence[Scenario]) -
     _say(f"{len(ids)} scenarios, {settings.trials} trial(s) each, from recovery and from initial starts")
     for start in STARTS:
         evaluate(settings, platform, ids, start)
-    tallies = [RunProgress(start, ids, settings.trials) for start in STARTS]
+    counts = [RunProgress(start, ids, settings.trials) for start in STARTS]
 
     def wanted(row: TrialRow) -> bool:
-        return any(tally.wanted(asdict(row)) for tally in tallies)
+        return any(count.wanted(asdict(row)) for count in counts)
 
     rows = [asdict(row) for row in read_trial_log(settings.trial_log) if wanted(row)]
     summary = summarise(rows, settings.trials)

@@ -5,43 +5,61 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from typing import IO
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 
 from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""
 _running: set[subprocess.Popen] = set()
+_POLL_S = 0.5
 CANNOT_START = "cannot start "
 """What `startable` begins a line with that names a run and says why it cannot be begun."""
 
 
-def run_module(module: str, argv: Sequence[str], kernels: Mapping[str, str], log: IO | None = None) -> int:
-    """Runs `python -m MODULE ARGV`, which ends with its parent, in good order if possible.
+def this_module(module: str) -> list[str]:
+    """Beginning of a command that runs a module of the project or of LeRobot."""
+    return [sys.executable, "-m", module]
+
+
+def run_program(
+    command: Sequence[str],
+    variables: Mapping[str, str],
+    output: Path | None = None,
+    watch: Callable[[], None] | None = None,
+) -> int:
+    """Runs a command that ends with its parent, in good order if possible.
 
     Args:
-        module: of the project or of LeRobot.
-        argv: its arguments.
-        kernels: variables that decide how it rounds; they win over the environment.
-        log: takes everything that it says; None leaves it on the terminal.
+        command: program and arguments.
+        variables: win over the environment, such as those that decide how a policy rounds.
+        output: file that takes everything that it says, at its end; None leaves it on the terminal.
+        watch: called twice a second while it runs.
 
     Returns:
         Its exit status.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *argv],
-        stdin=subprocess.DEVNULL, stdout=log, stderr=None if log is None else subprocess.STDOUT,
-        env={**DEFAULTS, **os.environ, **kernels}, preexec_fn=ends_with_this(),
-    )  # fmt: skip
-    _running.add(process)
-    try:
-        return process.wait()
-    except BaseException:
-        stop_children([process])
-        raise
-    finally:
-        _running.discard(process)
+    with nullcontext(None) if output is None else output.open("ab") as stream:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL, stdout=stream, stderr=None if stream is None else subprocess.STDOUT,
+            env={**DEFAULTS, **os.environ, **variables}, preexec_fn=ends_with_this(),
+        )  # fmt: skip
+        _running.add(process)
+        try:
+            while True:
+                try:
+                    return process.wait(None if watch is None else _POLL_S)
+                except subprocess.TimeoutExpired:
+                    if watch is not None:
+                        watch()
+        except BaseException:
+            stop_children([process])
+            raise
+        finally:
+            _running.discard(process)
 
 
 def stop_running() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,8 +17,8 @@ from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.child import run_module
-from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
+from lerobot_roborecover.evaluation.arms import Arm
+from lerobot_roborecover.evaluation.own_log import identity_of_run
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_log
 from lerobot_roborecover.platforms import platform_named
@@ -28,7 +26,6 @@ from lerobot_roborecover.platforms.registry import platform_of
 from lerobot_roborecover.reproduce.hours import Costs, RunLength, run_length
 from lerobot_roborecover.reproduce.scores import PublishedCheckpoint, PublishedScore
 from lerobot_roborecover.scenario import ScenarioError, Start
-from lerobot_roborecover.utils.atomic_io import atomic_write
 
 INITIAL, RECOVERY = str(Start.INITIAL), str(Start.RECOVERY)
 _TAKEN = ("--env.start", "--env.trial_log", "--output_dir", "--eval.n_episodes", "--config_path")
@@ -154,8 +151,6 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class ReproductionResult:
-    """What came of it."""
-
     plan: ReproductionPlan
     scenarios: int
     initial: ArmResult
@@ -199,32 +194,14 @@ def run_arms(plan: ReproductionPlan, say: Callable[[str], None] = print) -> Repr
 
 
 def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callable[[str], None]) -> ArmResult:
-    folder, log = plan.folder(start), plan.log(start)
-    done, argv = folder / "done.json", plan.argv(start)
-    length = plan.length(start, scenarios)
-    record: dict[str, Any] = json.loads(done.read_text()) if done.is_file() else {}
-    identity = plan.identity(start)
-    claim_log(log, identity, say)
-    same = record.get("argv") == argv and record.get("identity") == identity
-    if not (record.get("finished") and same):
-        say(f"{start}: {length.trials} trials, at most {length.hours:.2g} hours. {plan.command_line(start)}")
-        folder.mkdir(parents=True, exist_ok=True)
-        began = time.monotonic()
-        # Checkpoints and scenario sets come from the Hub, unless the caller is offline.
-        online = {"HF_HUB_OFFLINE": os.environ.get("HF_HUB_OFFLINE", "0")}
-        status = run_module("lerobot_roborecover.cli.main", argv, online)
-        before = record.get("seconds", 0.0) if record.get("identity") == identity else 0.0
-        seconds = before + time.monotonic() - began
-        atomic_write(
-            done,
-            json.dumps({"argv": argv, "identity": identity, "seconds": seconds, "finished": status == 0}),
-        )
-        record = {"seconds": seconds}
-        if status:
-            raise ScenarioError(
-                f"the {start} arm ended with status {status}; what it said is above. The same command goes "
-                f"on with what is left ({log})"
-            )
+    log, length = plan.log(start), plan.length(start, scenarios)
+    # Checkpoints and scenario sets come from the Hub, unless the caller is offline.
+    online = {"HF_HUB_OFFLINE": os.environ.get("HF_HUB_OFFLINE", "0")}
+    arm = Arm(f"the {start} arm", log, plan.argv(start), plan.identity(start), environment=online)
+    arm.run(
+        say,
+        f"{start}: {length.trials} trials, at most {length.hours:.2g} hours. {plan.command_line(start)}",
+    )
     ids = {s.id for s in scenarios}
     (read,), _ = with_first_states([read_log(log)])
     rows = [r for r in read.rows if r.scenario_id in ids and r.trial < plan.trials]
@@ -234,7 +211,7 @@ def _run(plan: ReproductionPlan, start: str, scenarios: ScenarioSet, say: Callab
             "are never averaged. Move it away, and run the same command again"
         )
     found = summarise([asdict(row) for row in rows], plan.trials).starts[Start(start)]
-    return ArmResult(start, tuple(rows), found, record["seconds"])
+    return ArmResult(start, tuple(rows), found, arm.seconds())
 
 
 def published_score(text: str) -> PublishedScore:

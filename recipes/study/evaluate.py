@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -14,10 +12,10 @@ from typing import Any
 from lerobot_roborecover.analysis.make import Gallery, Report, report
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.evaluation.child import CANNOT_START, run_module, stop_running
-from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
+from lerobot_roborecover.evaluation.arms import Arm
+from lerobot_roborecover.evaluation.child import CANNOT_START, run_program, stop_running, this_module
+from lerobot_roborecover.evaluation.own_log import identity_of_run
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.determinism import has_kernels
 from lerobot_roborecover.utils.text import output_end
 from lerobot_roborecover.workers.capacity import SLOT_GB, available_gb, usable_cores
@@ -31,8 +29,6 @@ from recipes.study.outcomes import (
     read_outcomes,
 )
 
-DONE_FILE = "done.json"
-"""Beside the log of an arm that has finished: the run that it was."""
 RUN_FILE = "run.yaml"
 """Beside the log of every arm: its run, as `roborecover eval --config_path` reads it."""
 ARM_GB = 1.0
@@ -83,14 +79,11 @@ def evaluate(
     jobs = jobs or max(1, min(cores, int(min(available_gb(), 1e6) / (ARM_GB + SLOT_GB))))
     todo = list(arms(study, out, ids if every > 1 else (), slots or max(cores // jobs, 1)))
 
-    check_arms([arm for arm in todo if not _finished(arm, ids)], study, out)
+    check_arms([arm for arm in todo if not run_of(arm, study, ids).finished()], study, out)
 
     def run(arm: StudyArm) -> float:
         began = time.monotonic()
-        if not _finished(arm, ids):
-            claim_log(arm.log, _identity(arm), say)
-            run_arm(arm, study)
-            atomic_write(arm.out / DONE_FILE, _what_ran(arm, ids))
+        run_arm(arm, study, ids, say)
         return time.monotonic() - began
 
     with ThreadPoolExecutor(jobs) as pool:
@@ -141,8 +134,8 @@ def check_arms(waiting: Sequence[StudyArm], study: StudyDefinition, out: Path) -
         arm.run.write(arm.out / RUN_FILE)
     runs = [str(arm.out / RUN_FILE) for arm in waiting]
     log = out / "trials" / "startable.log"
-    with log.open("wb") as stream:
-        status = run_module("recipes.study.startable", runs, study.environment, stream)
+    log.unlink(missing_ok=True)
+    status = run_program([*this_module("recipes.study.startable"), *runs], study.environment, log)
     if status:
         output = log.read_text(errors="replace")
         told = [f"  {line}" for line in output.splitlines() if line.startswith(CANNOT_START)]
@@ -153,33 +146,26 @@ def check_arms(waiting: Sequence[StudyArm], study: StudyDefinition, out: Path) -
         )
 
 
-def run_arm(arm: StudyArm, study: StudyDefinition) -> None:
-    """Runs an arm in a process of its own, which rounds as the study says; its output goes into a file.
+def run_arm(
+    arm: StudyArm, study: StudyDefinition, ids: Sequence[str], say: Callable[[str], None] = print
+) -> None:
+    """Runs an arm, unless it has finished.
 
     Raises:
         ScenarioError: it failed; the message has the end of its output.
     """
-    argv = arm.run.write(arm.out / RUN_FILE)
-    log = arm.out / "output.log"
-    with log.open("ab") as stream:
-        status = run_module("lerobot_roborecover.cli.main", argv, study.environment, stream)
-    if status:
-        cause, shown = output_end(log.read_text(errors="replace"), _SHOWN_LINES)
-        raise ScenarioError(
-            f"`roborecover {shlex.join(argv)}` ended with status {status}: {cause or 'it said nothing'}\n"
-            f"The end of {log}:\n{shown}\nRun the same command again to go on with what is left"
-        )
+    arm.run.write(arm.out / RUN_FILE)
+    run_of(arm, study, ids).run(say)
 
 
-def _finished(arm: StudyArm, ids: Sequence[str]) -> bool:
-    done = arm.out / DONE_FILE
-    return done.exists() and done.read_text() == _what_ran(arm, ids)
-
-
-def _what_ran(arm: StudyArm, ids: Sequence[str]) -> str:
+def run_of(arm: StudyArm, study: StudyDefinition, ids: Sequence[str]) -> Arm:
+    """An arm's run in a process of its own, which rounds as the study says; its output goes into a file."""
     # With other slots the trials are the same: what has finished is not run again for them.
-    run = replace(arm.run, runner={**arm.run.runner, "slots": 0}).config()
-    return json.dumps([run, ids, _identity(arm)], sort_keys=True)
+    same = replace(arm.run, runner={**arm.run.runner, "slots": 0}).config()
+    return Arm(
+        arm.label, arm.log, ["eval", f"--config_path={arm.out / RUN_FILE}"], _identity(arm),
+        decides=[same, list(ids)], environment=study.environment, output=arm.out / "output.log",
+    )  # fmt: skip
 
 
 def _identity(arm: StudyArm) -> dict[str, Any]:

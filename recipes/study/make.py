@@ -15,12 +15,12 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
 from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
-from lerobot_roborecover.evaluation.child import run_module
-from lerobot_roborecover.policies.ship import ship
+from lerobot_roborecover.evaluation.child import run_program, this_module
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
 from lerobot_roborecover.utils.determinism import KERNELS
 from lerobot_roborecover.utils.journal import append_records
+from recipes.ship import ship
 from recipes.study.definition import StudyDefinition, read_definition, write_definition
 from recipes.study.recipe import StudyRecipe, read_recipe
 from recipes.study.stages import CHECKPOINT, stages
@@ -124,7 +124,7 @@ def _forget_place(path: Path) -> None:
 
 def _run(command: Sequence[str]) -> None:
     module, *argv = command
-    status = run_module(module, argv, KERNELS)
+    status = run_program([*this_module(module), *argv], KERNELS)
     if status:
         raise ScenarioError(
             f"`python -m {shlex.join(command)}` ended with status {status}; what it said is above. "

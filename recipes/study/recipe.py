@@ -25,7 +25,7 @@ class StudyRecipe:
     chain: str
     """The scenarios' recipe."""
     chain_root: str
-    """The folder that it works in unless told otherwise."""
+    """The folder that it works in unless an option says otherwise."""
     dataset: str = ""
     """Name of the set that comes with the package, which the study names where its scenarios are the same."""
     env: dict[str, str] = field(default_factory=dict)

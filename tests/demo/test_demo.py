@@ -273,25 +273,25 @@ def test_log_tail_waits_for_the_end_of_a_line(tmp_path):
 
 def test_progress_counts_what_was_asked_for(dataset):
     ids = ["fake-push-left-000", "fake-push-right-001"]
-    tally = RunProgress("recovery", ids, 2)
+    counts = RunProgress("recovery", ids, 2)
     outcomes = {ids[0]: ["success", "horizon", "success"], "fake-push-left-002": ["success"]}
-    tally.add(rows_of(dataset, outcomes) + rows_of(dataset, {ids[1]: ["success"]}, start="initial"))
-    assert (tally.done, tally.total, tally.rate) == (2, 4, 0.5)
-    tally.add(rows_of(dataset, {ids[1]: ["success"]}))
-    assert tally.rate == 0.75, "scenarios count the same, however many of their trials are done"
+    counts.add(rows_of(dataset, outcomes) + rows_of(dataset, {ids[1]: ["success"]}, start="initial"))
+    assert (counts.done, counts.total, counts.rate) == (2, 4, 0.5)
+    counts.add(rows_of(dataset, {ids[1]: ["success"]}))
+    assert counts.rate == 0.75, "scenarios count the same, however many of their trials are done"
 
 
 def test_progress_line_tells_the_pace_of_trials_alone(dataset):
     ids = ["fake-push-left-000", "fake-push-right-001"]
-    tally = RunProgress("recovery", ids, 3)
+    counts = RunProgress("recovery", ids, 3)
     now = [0.0]
     stream = io.StringIO()
     progress = ProgressLine("recovery", stream, lambda: now[0])
 
     def shown(at_s: float, **finished: list[str]) -> str:
         now[0] = at_s
-        tally.add(rows_of(dataset, {ids[int(k[1])]: v for k, v in finished.items()}))
-        progress.show(tally, final=True)
+        counts.add(rows_of(dataset, {ids[int(k[1])]: v for k, v in finished.items()}))
+        progress.show(counts, final=True)
         return stream.getvalue().splitlines()[-1]
 
     assert shown(0, s0=["success"]).endswith(
@@ -303,14 +303,14 @@ def test_progress_line_tells_the_pace_of_trials_alone(dataset):
 
 
 def test_progress_in_a_file_repeats_itself_only_now_and_then(dataset):
-    tally = RunProgress("recovery", ["fake-push-left-000"], 3)
+    counts = RunProgress("recovery", ["fake-push-left-000"], 3)
     now = [0.0]
     stream = io.StringIO()
     progress = ProgressLine("recovery", stream, lambda: now[0])
     for second in range(31):
         now[0] = float(second)
-        tally.add(rows_of(dataset, {"fake-push-left-000": ["success"] * (second // 10)}))
-        progress.show(tally)
+        counts.add(rows_of(dataset, {"fake-push-left-000": ["success"] * (second // 10)}))
+        progress.show(counts)
     assert [line.split()[1] for line in stream.getvalue().splitlines()] == ["0/3", "1/3", "3/3"]
 
 

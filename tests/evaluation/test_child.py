@@ -42,7 +42,8 @@ def wait_for(path: Path) -> None:
 
 def test_an_interrupted_study_lets_its_children_put_things_in_order(module, tmp_path):
     done: list[int] = []
-    thread = threading.Thread(target=lambda: done.append(child.run_module(module, [str(tmp_path)], {})))
+    command = [*child.this_module(module), str(tmp_path)]
+    thread = threading.Thread(target=lambda: done.append(child.run_program(command, {})))
     thread.start()
     wait_for(tmp_path / "began")
     child.stop_running()
@@ -64,5 +65,5 @@ def test_an_interrupt_while_a_child_is_waited_for_stops_it(module, tmp_path, mon
 
     monkeypatch.setattr(Popen, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        child.run_module(module, [str(tmp_path)], {})
+        child.run_program([*child.this_module(module), str(tmp_path)], {})
     assert (tmp_path / "ended").exists()

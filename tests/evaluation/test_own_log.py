@@ -14,7 +14,7 @@ from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
 from recipes.study.arms import arms
 from recipes.study.definition import StudyDefinition
-from recipes.study.evaluate import _what_ran
+from recipes.study.evaluate import run_of
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.trial_rows import trial_row, write_log
 
@@ -58,12 +58,14 @@ def test_a_study_is_not_finished_with_another_policy(checkpoint, tmp_path):
     study = StudyDefinition(tmp_path, "fake", {"act": 1}, "act")
 
     def ran(slots=0):
-        return [_what_ran(arm, ["a"]) for arm in arms(study, tmp_path / "out", (), slots)]
+        return [run_of(arm, study, ["a"]) for arm in arms(study, tmp_path / "out", (), slots)]
 
-    before = ran()
-    assert ran(slots=3) == before
+    for run in ran():
+        run.log.parent.mkdir(parents=True)
+        run.log.with_name("done.json").write_text(json.dumps({**run._key(), "seconds": 1, "finished": True}))
+    assert all(run.finished() for run in (*ran(), *ran(slots=3)))
     (tmp_path / "policies" / "act" / "policy_preprocessor.json").write_text("[]")
-    assert not set(before) & set(ran())
+    assert not any(run.finished() for run in ran())
 
 
 def test_a_reproduction_knows_its_policy(checkpoint, tmp_path):

@@ -28,7 +28,7 @@ def test_ship(tmp_path):
     import torch
     from safetensors.torch import load_file, save_file
 
-    from lerobot_roborecover.policies.ship import ship
+    from recipes.ship import ship
 
     made = tmp_path / "pretrained_model"
     made.mkdir()

@@ -85,7 +85,7 @@ def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
     assert main([*again, "--no-report"]) == 0
     assert "8 of 8 trials came out as stored" in capsys.readouterr().out
 
-    # A stored outcome that is another one is told apart, and what has finished is not run again.
+    # A stored outcome that is another one is distinguished, and what has finished is not run again.
     key = next(k for k in outcomes if k[0] == "act/recovery")
     write_outcomes(study / "outcomes.csv", {**outcomes, key: ("success", 3)})
     before = (out / "trials" / "act-recovery" / "output.log").stat().st_mtime_ns
@@ -194,7 +194,7 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path)
     (study / "policies" / "act" / "config.json").write_text("{}")
     found = read_definition(study)
     with pytest.raises(ScenarioError, match=r"(?s)ended with status.*Run the same command again"):
-        run_arm(next(iter(arms(found, tmp_path / "out"))), found)
+        run_arm(next(iter(arms(found, tmp_path / "out"))), found, ())
 
 
 @pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])

@@ -37,11 +37,11 @@ def test_every_trial_of_the_shipped_study_is_stored(name):
 @pytest.mark.slow
 def test_a_trial_that_a_bit_decides_comes_out_as_stored(tmp_path):
     """One step sooner on an AMD EPYC than on an Intel processor, as long as MKL took the square roots of its
-    noise schedule in float32 (`trials/portable.py`), and with other kernels of MKL."""
+    noise schedule in float32 (`policies/determinism.py`), and with other kernels of MKL."""
     scenario = "scripted-operator-push-v3-s502-000049"
     study = read_definition(shipped_study())
     (arm,) = (a for a in arms(study, tmp_path, [scenario], slots=1) if a.label == "diffusion/initial")
-    run_arm(arm, study)
+    run_arm(arm, study, [scenario])
     assert outcomes_of([arm]) == {
         (arm.label, scenario, 0): ("success", 126),
         (arm.label, scenario, 1): ("success", 81),

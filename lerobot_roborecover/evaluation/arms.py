@@ -1,0 +1,112 @@
+"""An arm: one policy from one start, run in a process of its own until its log has every trial.
+
+`demo`, `reproduce` and the studies of `recipes/` run their arms here, so in each of them a rerun goes on
+where it was, an arm that has finished is not run again, and a failure shows the end of the output.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_roborecover.evaluation.child import run_program, this_module
+from lerobot_roborecover.evaluation.own_log import claim_log
+from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.atomic_io import atomic_write
+from lerobot_roborecover.utils.text import output_end
+
+DONE_FILE = "done.json"
+"""Beside the log of an arm: the run that it was, and whether it has finished."""
+_SHOWN_LINES = 12
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One run of `roborecover eval`, with a folder of its own."""
+
+    name: str
+    """What messages call it, e.g. `the initial arm`."""
+    log: Path
+    """Its trial log; what else is kept of it lies beside."""
+    argv: Sequence[str]
+    """Arguments of `roborecover`."""
+    identity: Mapping[str, Any]
+    """What all rows of the log must share, see `own_log.identity_of_run`."""
+    decides: Any = None
+    """What the run must share with a finished one, JSON-able; the arguments where it is None."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Variables that win over the caller's, such as those that decide how a policy rounds."""
+    output: Path | None = None
+    """File of what the run prints; None leaves it on the terminal."""
+
+    def finished(self) -> bool:
+        """Whether an earlier run of the same has finished."""
+        record = self._record()
+        return bool(record.get("finished")) and all(record.get(k) == v for k, v in self._key().items())
+
+    def seconds(self) -> float:
+        """Wall time of its runs so far, under the identity of today."""
+        record = self._record()
+        return float(record.get("seconds", 0.0)) if record.get("identity") == self._key()["identity"] else 0.0
+
+    def run(self, say: Callable[[str], None], plan: str = "") -> None:
+        """Runs what is not done yet.
+
+        Args:
+            say: takes progress lines.
+            plan: said before it is begun.
+
+        Raises:
+            ScenarioError: it failed; the same command goes on with what is left.
+        """
+        claim_log(self.log, self.identity, say)
+        if self.finished():
+            return
+        if plan:
+            say(plan)
+        before, began = self.seconds(), time.monotonic()
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        command = [*this_module("lerobot_roborecover.cli.main"), *self.argv]
+        status = run_program(command, self.environment, self.output)
+        seconds = before + time.monotonic() - began
+        done = {**self._key(), "seconds": seconds, "finished": status == 0}
+        atomic_write(self.log.with_name(DONE_FILE), json.dumps(done))
+        if status:
+            raise ScenarioError(
+                failure(f"{self.name} (`{shlex.join(['roborecover', *self.argv])}`)", status, self.output)
+            )
+
+    def _key(self) -> dict[str, Any]:
+        decides = list(self.argv) if self.decides is None else self.decides
+        return json.loads(json.dumps({"argv": decides, "identity": self.identity}))
+
+    def _record(self) -> dict[str, Any]:
+        try:
+            record = json.loads(self.log.with_name(DONE_FILE).read_text())
+        except (OSError, ValueError):
+            return {}
+        return record if isinstance(record, dict) else {}
+
+
+def failure(name: str, status: int, output: Path | None, done: str = "") -> str:
+    """Says how a run ended that failed.
+
+    Args:
+        name: what was run.
+        status: its exit status.
+        output: file of what it printed; None where that is on the terminal.
+        done: how far it came, e.g. ` after 3 of 8 trials`.
+    """
+    ended = f"{name} ended with status {status}{done}"
+    if output is None:
+        return f"{ended}; what it said is above. The same command goes on with what is left"
+    cause, shown = output_end(output.read_text(errors="replace"), _SHOWN_LINES)
+    return (
+        f"{ended}: {cause or 'it said nothing'}\nThe end of {output}:\n{shown}\n"
+        "Run the same command again to go on with what is left; 'roborecover doctor' checks this machine"
+    )
