@@ -13,7 +13,6 @@ OPTIONS = DemoSettings
 
 
 def run(options: DemoSettings) -> int:
-    """Runs the demo."""
     from lerobot_roborecover.demo.run import run_demo
 
     run_demo(options)

@@ -47,14 +47,14 @@ OPTIONS = DetectOptions
 
 def run(options: DetectOptions) -> int:
     """Runs the trials, computes, writes and prints; or reports an earlier comparison."""
-    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+    from lerobot_roborecover.policies.detectors.interface import DetectorError
 
     if options.scores:
         refuse_with_scores(options.needed)
         return report_scores(options.scores, options.out)
     missing = [name for name, value in options.needed.items() if not value]
     if missing:
-        raise MonitorError(
+        raise DetectorError(
             f"--{missing[0]} is missing. Give --detector, --scenarios and --policy to compare detectors; or "
             "--scores, the --out of an earlier comparison, to report it again"
         )
@@ -68,13 +68,13 @@ def refuse_with_scores(given: Mapping[str, object]) -> None:
         given: their values, by name.
 
     Raises:
-        MonitorError: one of them is given.
+        DetectorError: one of them is given.
     """
-    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+    from lerobot_roborecover.policies.detectors.interface import DetectorError
 
     clash = [name for name, value in given.items() if value]
     if clash:
-        raise MonitorError(
+        raise DetectorError(
             f"--{clash[0]} does not belong to --scores, which reports a finished comparison. Leave out one"
         )
 

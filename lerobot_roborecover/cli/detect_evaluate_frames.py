@@ -69,23 +69,18 @@ def run(options: FrameOptions) -> int:
     from lerobot_roborecover.analysis.stats.monitor_curves import choose_threshold
     from lerobot_roborecover.analysis.stats.monitor_report import monitor_report
     from lerobot_roborecover.detection.data.judging import judge_dataset
-    from lerobot_roborecover.policies.detectors.interface import TrainedMonitor
+    from lerobot_roborecover.policies.detectors.interface import DetectorError
     from lerobot_roborecover.policies.detectors.loading import load_monitor
-    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
     from lerobot_roborecover.utils.outputs import check_page
     from lerobot_roborecover.utils.progress import Progress
 
     check_page(options.out, MONITOR_FILES)
     if options.threshold is not None and options.choose_threshold:
-        raise MonitorError("--threshold and --choose-threshold: give one of them")
+        raise DetectorError("--threshold and --choose-threshold: give one of them")
     if options.threshold is not None and not 0 < options.threshold < 1:
-        raise MonitorError(f"--threshold={options.threshold}: must be above 0 and below 1")
+        raise DetectorError(f"--threshold={options.threshold}: must be above 0 and below 1")
     overrides = {"base_model": options.base_model} if options.base_model else {}
     monitor = load_monitor(options.monitor, options.device, options.revision, **overrides)
-    if not isinstance(monitor, TrainedMonitor):
-        raise MonitorError(
-            f"{options.monitor} has no record of what it was trained on, which is measured against"
-        )
     judged = []
     for text in options.data:
         name, rest = split_named(text)
@@ -98,13 +93,13 @@ def run(options: FrameOptions) -> int:
         )
         judged.append((name or Path(rest).name, frames))
     if len({name for name, _ in judged}) < len(judged):
-        raise MonitorError(f"two datasets have one name: {[n for n, _ in judged]}; write --data NAME=DIR")
+        raise DetectorError(f"two datasets have one name: {[n for n, _ in judged]}; write --data NAME=DIR")
     threshold = options.threshold
     if options.choose_threshold:
         try:
             threshold = choose_threshold(judged[0][1], options.choose_threshold)
         except ValueError as err:
-            raise MonitorError(f"--choose-threshold={options.choose_threshold}: {err}") from None
+            raise DetectorError(f"--choose-threshold={options.choose_threshold}: {err}") from None
     if threshold is not None:
         judged = [(name, frames.at(threshold)) for name, frames in judged]
     measured = [
@@ -116,7 +111,7 @@ def run(options: FrameOptions) -> int:
     about = {
         "monitor": options.monitor,
         "type": monitor.config.type,
-        "reads": ", ".join(monitor.input_features),
+        "reads": ", ".join(monitor.needs.features),
         "trained on": f"{len(trained)} scenarios" if trained else "not known",
         "decision": "the monitor's own" if threshold is None else f"score > {threshold:.6g}",
         "threshold": threshold,

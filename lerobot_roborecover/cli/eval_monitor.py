@@ -36,7 +36,6 @@ class EvalMonitorOptions(FrameOptions):
     """Folder of trials and observations, kept between runs (OUT.work)."""
 
     def comparison(self) -> DetectOptions:
-        """Returns the options of `detect evaluate`."""
         source = replace(self.side_by_side.source, workers=self.workers)
         return DetectOptions(
             comparison=replace(self.side_by_side, source=source),
@@ -52,7 +51,7 @@ OPTIONS = EvalMonitorOptions
 
 def run(options: EvalMonitorOptions) -> int:
     """Runs the one of the two commands that the options belong to."""
-    from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+    from lerobot_roborecover.policies.detectors.interface import DetectorError
 
     frames = {"monitor": options.monitor, "data": options.data}
     comparison = options.comparison()
@@ -66,7 +65,7 @@ def run(options: EvalMonitorOptions) -> int:
     if missing or clash:
         first = next(iter(wanted))
         what = f"--{missing[0]} is missing" if missing else f"--{clash[0]} does not belong to --{first}"
-        raise MonitorError(
+        raise DetectorError(
             f"{what}. Give --monitor and --data to measure a monitor on frames; or --detector, --scenarios "
             "and --policy to compare detectors on a policy's trials"
         )

@@ -17,7 +17,7 @@ from lerobot_roborecover.datasets.lerobot_folder import check_lerobot_folder, op
 from lerobot_roborecover.detection.forked import SeenForks
 from lerobot_roborecover.detection.scoring import PolicySignals
 from lerobot_roborecover.detection.trials import ReplayedTrial
-from lerobot_roborecover.policies.detectors.interface import DetectorNeeds
+from lerobot_roborecover.policies.detectors.interface import DetectorError, DetectorNeeds
 from lerobot_roborecover.policies.detectors.modeling_policy import (
     RoboRecoverPolicyFeaturesRewardModel,
     RoboRecoverRecoveryGainRewardModel,
@@ -25,7 +25,6 @@ from lerobot_roborecover.policies.detectors.modeling_policy import (
 from lerobot_roborecover.policies.detectors.modeling_states import (
     RoboRecoverStateDistanceRewardModel,
 )
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from lerobot_roborecover.scenario import ScenarioError
 
 
@@ -43,7 +42,7 @@ def fit_states(
         What it was fitted to, in words.
 
     Raises:
-        MonitorError: there are no such states.
+        DetectorError: there are no such states.
     """
     keys = detector.config.key_list
     if training_data is not None:
@@ -52,7 +51,7 @@ def fit_states(
         return f"{len(texts)} frames of {training_data}"
     chosen = [t for t in trials if t.row.start == "initial" and t.row.success]
     if not chosen:
-        raise MonitorError(
+        raise DetectorError(
             "state_distance: no clean rollout of the fitting split succeeds. Give the policy's own training "
             "set with --training-data, or another --fit-split"
         )
@@ -69,17 +68,17 @@ def check_training_data(root: Path) -> None:
     """Refuses a folder that is no LeRobotDataset.
 
     Raises:
-        MonitorError: naming it.
+        DetectorError: naming it.
     """
     if not (root / "meta" / "info.json").is_file():
-        raise MonitorError(
+        raise DetectorError(
             f"--training-data {root}: no LeRobotDataset there (it has no meta/info.json). Give the folder of "
             "one, downloaded from the Hub or recorded"
         )
     try:
         check_lerobot_folder(root)
     except ScenarioError as err:
-        raise MonitorError(f"--training-data: {err}") from None
+        raise DetectorError(f"--training-data: {err}") from None
 
 
 def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Tensor], list[str]]:
@@ -90,13 +89,13 @@ def training_states(root: Path, keys: Sequence[str]) -> tuple[dict[str, torch.Te
         keys: columns.
 
     Raises:
-        MonitorError: it lacks one.
+        DetectorError: it lacks one.
     """
     check_training_data(root)
     dataset: Any = open_lerobot_folder(root)
     missing = [k for k in keys if k not in dataset.features]
     if missing:
-        raise MonitorError(
+        raise DetectorError(
             f"--training-data {root}: has no {missing[0]}, only "
             f"{sorted(k for k in dataset.features if k.startswith('observation'))}. Name others with "
             "state_distance,keys=..."
@@ -122,7 +121,7 @@ def fit_features(
         What it was fitted to, in words.
 
     Raises:
-        MonitorError: one of the labels is missing.
+        DetectorError: one of the labels is missing.
     """
     features, labels, used = [], [], []
     needs = DetectorNeeds(internals=True)
@@ -135,7 +134,9 @@ def fit_features(
         labels.append(torch.full((len(rows),), float(not trial.row.success)))
         used.append(trial)
     if not used:
-        raise MonitorError("policy_features: the fitting split has no usable trial. Name another --fit-split")
+        raise DetectorError(
+            "policy_features: the fitting split has no usable trial. Name another --fit-split"
+        )
     detector.fit(torch.cat(features), torch.cat(labels))
     _remember(detector, used)
     counts: Mapping[str, int] = detector.config.labels
@@ -156,7 +157,7 @@ def fit_gain(
         What it was fitted to, in words.
 
     Raises:
-        MonitorError: the intervention rescued no trial.
+        DetectorError: the intervention rescued no trial.
     """
     features, gains = [], []
     for forked in forks:

@@ -19,7 +19,7 @@ from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
 from lerobot_roborecover.logs.policy_settings import digest_of
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 from lerobot_roborecover.scenario import ScenarioError
 
 
@@ -67,29 +67,29 @@ def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
         arm: label of the arm, or how it begins; empty where the log has one.
 
     Raises:
-        MonitorError: it is not there, is of another policy, or the arm is not one of its.
+        DetectorError: it is not there, is of another policy, or the arm is not one of its.
         ScenarioError, TrialLogError: it has no forks, or is damaged.
     """
     path = log / TRIALS_FILE if log.is_dir() else log
     if not path.is_file():
-        raise MonitorError(f"--forks {log}: no log there; `roborecover detect fork --out {log}` writes one")
+        raise DetectorError(f"--forks {log}: no log there; `roborecover detect fork --out {log}` writes one")
     gains = fork_gains(read_trial_log(path))
     arms = [a for a in gains.arms if a == arm] or [a for a in gains.arms if a.startswith(arm)]
     if len(arms) != 1:
-        raise MonitorError(
+        raise DetectorError(
             f"--forks {log}: {'no' if not arms else 'more than one'} arm begins with {arm!r}; it has "
             f"{', '.join(gains.arms)}. Name one: recovery_gain,arm=..."
         )
     pairs = [p for p in gains.pairs if p.note.arm == arms[0]]
     others = sorted({p.continued.policy for p in pairs} - {policy})
     if others:
-        raise MonitorError(
+        raise DetectorError(
             f"--forks {log}: forks of {others[0]}, and the policy that is watched is {policy}. Fork its own "
             "trials"
         )
     settings = {digest_of(p.continued.policy_settings) for p in pairs}
     if len(settings) > 1:
-        raise MonitorError(
+        raise DetectorError(
             f"--forks {log}: forks of {policy} under {len(settings)} settings of its own, which would be "
             "mixed. Keep one in a log"
         )
@@ -108,7 +108,7 @@ def see_forks(
         log: of the watched policy.
         source: whose scenarios, observations and working folder they share.
         env_batch: as of `replay_trials`.
-        progress: told of what, how many are done, of how many.
+        progress: called with the step's name, how many are done, and of how many.
 
     Raises:
         ScenarioError: scenarios are not those of the set, or actions are missing.

@@ -18,7 +18,7 @@ from lerobot_roborecover.detection.fitting import (
 from lerobot_roborecover.detection.forked import ForkLog, read_forks, see_forks
 from lerobot_roborecover.detection.scoring import PolicySignals
 from lerobot_roborecover.detection.trials import ReplayedTrial, TrialSource, replay_trials
-from lerobot_roborecover.policies.detectors.interface import Detector
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorError
 from lerobot_roborecover.policies.detectors.modeling_policy import (
     FeatureNetwork,
     RoboRecoverPolicyFeaturesRewardModel,
@@ -27,7 +27,6 @@ from lerobot_roborecover.policies.detectors.modeling_policy import (
 from lerobot_roborecover.policies.detectors.modeling_states import (
     RoboRecoverStateDistanceRewardModel,
 )
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import ScenarioError
 
@@ -81,14 +80,14 @@ def fork_logs(
         links: what is measured on.
 
     Raises:
-        MonitorError, ScenarioError: the log is missing, of another policy, or of the scenarios measured on;
+        DetectorError, ScenarioError: the log is missing, of another policy, or of the scenarios measured on;
             or no detector learns from it.
     """
     from lerobot_roborecover.evaluation.loading import policy_config
 
     learning = {n.name: d for n in named if _learns_from_forks(d := n.detector)}
     if bool(learning) != (request.forks is not None):
-        raise MonitorError(
+        raise DetectorError(
             f"--detector {min(learning)} learns from forks: give --forks LOG, which `roborecover detect "
             "fork` makes of the policy's trials on other scenarios"
             if learning
@@ -115,7 +114,7 @@ def check_fitting(
         links: what is measured on.
 
     Raises:
-        MonitorError, ScenarioError: saying which.
+        DetectorError, ScenarioError: saying which.
     """
     learning = [n.name for n in named if _learns_from_trials(n, request)]
     if learning and {s.id for s in _fitted_to(request)} & {link.id for link in links}:

@@ -27,18 +27,14 @@ from lerobot_roborecover.detection.options import DetectionRequest
 from lerobot_roborecover.detection.scoring import PolicySignals, cost_ms, score_trials
 from lerobot_roborecover.detection.trials import ReplayedTrial, replay_trials
 from lerobot_roborecover.policies.detectors.base import DetectorRewardModel
-from lerobot_roborecover.policies.detectors.interface import Detector, MonitorDetector
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorError
 from lerobot_roborecover.policies.detectors.loading import (
     check_needs,
     load_detector,
     split_options,
 )
-from lerobot_roborecover.policies.detectors.modeling_policy import (
-    RoboRecoverPolicyFeaturesRewardModel,
-)
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
-from lerobot_roborecover.policies.detectors.progress import ProgressDetector
 from lerobot_roborecover.utils.atomic_io import atomic_dir
 
 TRUTHS = ("recovery_point", "outcome")
@@ -71,22 +67,9 @@ class NamedDetector:
     fitted_to: str = ""
 
     @property
-    def decides(self) -> bool:
-        """Whether it has decisions of its own."""
-        if isinstance(self.detector, DetectorRewardModel):
-            return self.detector.config.threshold is not None
-        return not isinstance(self.detector, ProgressDetector) or self.detector.options.threshold is not None
-
-    @property
-    def probabilities(self) -> bool:
-        """Whether its scores are probabilities."""
-        return isinstance(self.detector, MonitorDetector | RoboRecoverPolicyFeaturesRewardModel)
-
-    @property
     def trained_on(self) -> Mapping[str, Any]:
-        """What it was trained on, as far as it says."""
-        inner = self.detector.monitor if isinstance(self.detector, MonitorDetector) else self.detector
-        return getattr(inner, "trained_on", {}).get("scenarios", {})
+        """Hashes by id of the scenarios that it was trained on, as far as it says."""
+        return self.detector.trained_on.get("scenarios", {})
 
 
 def compare_detectors(
@@ -97,27 +80,27 @@ def compare_detectors(
     Args:
         request: what to compare.
         out: folder of the report.
-        progress: told of what, how many are done, of how many.
+        progress: called with the step's name, how many are done, and of how many.
 
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what cannot be done, and the remedy; what
             detectors lack is said before anything runs.
     """
     if not 0.0 < request.alpha < 1.0:
-        raise MonitorError(f"--alpha={request.alpha}: must be above 0 and below 1")
+        raise DetectorError(f"--alpha={request.alpha}: must be above 0 and below 1")
     source = request.source
     scenarios = load_scenarios(
         source.scenarios, revision=source.revision, split=request.split, select=source.select
     )
     named = [_load(text, request) for text in request.detectors]
     if len({n.name for n in named}) < len(named):
-        raise MonitorError(
+        raise DetectorError(
             f"two detectors have one name: {[n.name for n in named]}; write --detector NAME=WHAT"
         )
     tested = [n.name for n in named if not _knows(n.what)]
     unknown = sorted(set(request.against) - set(tested))
     if unknown:
-        raise MonitorError(f"--against {unknown[0]!r:.80}: those that are tested are {', '.join(tested)}")
+        raise DetectorError(f"--against {unknown[0]!r:.80}: those that are tested are {', '.join(tested)}")
     links = [ScenarioLink(s.id, s.sha256(), "") for s in scenarios]
     if not request.on_training_scenarios:
         for n in named:
@@ -140,14 +123,14 @@ def compare_detectors(
             n.detector, trials, looks, lambda done, total, told=told: progress(told, done, total)
         )
         report = detection_report(
-            scored[n.name], alpha=request.alpha, probabilities=n.probabilities, decides=n.decides,
-            seed=request.seed, level=request.level,
+            scored[n.name], alpha=request.alpha, probabilities=n.detector.probabilities,
+            decides=n.detector.decides, seed=request.seed, level=request.level,
         )  # fmt: skip
         saved = _save(n, report.threshold, out)
         cost = cost_ms(n.detector, trials, probe)
         measured.append(
             MeasuredDetector(
-                n.name, n.what, _reads(n.detector), n.fitted_to, n.probabilities, report, cost, saved
+                n.name, n.what, _reads(n.detector), n.fitted_to, n.detector.probabilities, report, cost, saved
             )
         )
     reports = {m.name: m.report for m in measured if m.name in tested}
@@ -165,7 +148,7 @@ def _load(text: str, request: DetectionRequest) -> NamedDetector:
     name, _ = split_named(head)
     what = text[len(name) + 1 :] if name else text
     detector = load_detector(what, request.device)
-    if request.base_model and isinstance(detector, MonitorDetector):
+    if request.base_model and isinstance(detector, MonitorRewardModel):
         detector = load_detector(what, request.device, base_model=request.base_model)
     kind = split_options(what)[0]
     return NamedDetector(name or Path(kind).name, what, detector)
@@ -183,7 +166,7 @@ def _host(request: DetectionRequest, platform: str) -> tuple[Any, dict[str, Any]
     config = loading.policy_config(source.policy, (), source.device)
     host = loading.load_host(loading.HostSpec(config, env, {}, source.run_seed))
     if not isinstance(host, LocalPolicyRunner):
-        raise MonitorError(
+        raise DetectorError(
             f"--policy {source.policy}: detectors are compared on a LeRobot checkpoint that runs in this "
             f"process; this is a {config.type!r} policy. Name the policy within"
         )
@@ -206,7 +189,8 @@ def _save(named: NamedDetector, threshold: float, out: Path) -> str:
     """Where a composite policy finds it with its threshold; empty where it is no detector of ours, cannot be
     used, or has no threshold."""
     detector = named.detector
-    if not isinstance(detector, DetectorRewardModel) or detector.needs.truth or not math.isfinite(threshold):
+    own = isinstance(detector, DetectorRewardModel) and not isinstance(detector, MonitorRewardModel)
+    if not own or detector.needs.truth or not math.isfinite(threshold):
         return ""
     folder = out / DETECTORS_FOLDER / named.name
     own = detector.config

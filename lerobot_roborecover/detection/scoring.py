@@ -84,24 +84,24 @@ def windows_of(
     """By segment of the trial, what a detector is asked about at each of its steps."""
     found = []
     for segment, looked in zip(trial.segments, looks.of(trial, needs), strict=True):
-        glimpses = [
+        observations = [
             StepObservation(o, *look) for o, look in zip(observations_of(trial, segment), looked, strict=True)
         ]
         replayed = segment.start < trial.handoff
-        deviated, helpless = float("nan"), float("nan")
+        deviated, will_fail = float("nan"), float("nan")
         if trial.row.start == "recovery":
             deviated = float(not replayed)
         elif trial.row.success:
             deviated = 0.0
         if not replayed and (trial.row.start == "recovery" or trial.row.success):
-            helpless = float(not trial.row.success)
+            will_fail = float(not trial.row.success)
         found.append(
             [
                 DetectorWindow(
-                    glimpses[max(n - needs.past, 0) : n + 1], trial.scenario.task.instruction, n,
-                    trial.row.trial_seed or 0, deviated, helpless,
+                    observations[max(n - needs.past, 0) : n + 1], trial.scenario.task.instruction, n,
+                    trial.row.trial_seed or 0, deviated, will_fail,
                 )
-                for n in range(len(glimpses))
+                for n in range(len(observations))
             ]
         )  # fmt: skip
     return found
@@ -119,7 +119,7 @@ def score_trials(
         detector: loaded, and fitted where that is needed.
         trials: of the policy that it watches.
         looks: into that policy.
-        on_trial: told how many trials are done, of how many.
+        on_trial: called with how many trials are done, of how many.
     """
     scored = []
     for number, trial in enumerate(trials, 1):
@@ -150,21 +150,21 @@ def cost_ms(detector: Detector, trials: Sequence[ReplayedTrial], probe: PolicyPr
         n = (number * 7919) % (segment.stop - segment.start)
         steps = observations_of(trial, slice(segment.start, segment.start + n + 1))
         text, seed = trial.scenario.task.instruction, trial.row.trial_seed or 0
-        glimpses = [StepObservation(o) for o in steps[-(needs.past + 1) :]]
+        observations = [StepObservation(o) for o in steps[-(needs.past + 1) :]]
         if needs.of_policy and probe is not None:
             # Those of earlier steps are kept from step to step: only now's is asked for.
-            ask = [(steps[max(k - probe.past, 0) : k + 1], k) for k in range(len(steps))][-len(glimpses) :]
+            ask = [(steps[max(k - probe.past, 0) : k + 1], k) for k in range(len(steps))][-needs.past - 1 :]
             earlier = [probe.look([w], [text], [noise_seed(seed, k)], needs)[0] for w, k in ask[:-1]]
             began = time.perf_counter()
             now = probe.look([ask[-1][0]], [text], [noise_seed(seed, n)], needs)[0]
             asked = time.perf_counter() - began
-            glimpses = [
+            observations = [
                 StepObservation(g.observation, *look)
-                for g, look in zip(glimpses, [*earlier, now], strict=True)
+                for g, look in zip(observations, [*earlier, now], strict=True)
             ]
         else:
             asked = 0.0
-        window = DetectorWindow(glimpses, text, n, seed, 0.0, 0.0)
+        window = DetectorWindow(observations, text, n, seed, 0.0, 0.0)
         began = time.perf_counter()
         detector.judge_windows([window])
         spent.append(asked + time.perf_counter() - began)

@@ -36,8 +36,6 @@ _AT_ONCE = 256
 
 @dataclass(frozen=True)
 class TrialSource:
-    """Which trials."""
-
     scenarios: str = option("", show_default=False)
     """Scenario set: folder, Hub id or shipped name."""
     policy: str = option("", metavar="CHECKPOINT", show_default=False, checkpoint=True)
@@ -67,7 +65,6 @@ class TrialSource:
         return found + ([f"--revision={self.revision}"] if self.revision else [])
 
     def env_config(self, platform: str, split: str, start: str) -> RecoveryEnvConfig:
-        """What is observed."""
         return env_config(platform, self.scenarios, self.env_options(split, start))
 
 
@@ -108,7 +105,7 @@ def replay_trials(
         source: which.
         split: of the set.
         env_batch: a policy host's, which makes LeRobot's batches of raw observations.
-        progress: told of what, how many are done, of how many.
+        progress: called with the step's name, how many are done, and of how many.
 
     Returns:
         Trials in the order of their scenarios, and how many were left out, by reason.

@@ -8,9 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 from tests.support.factories import save_policy
-from tests.support.small_interventions import HashMonitor
 
 pytestmark = pytest.mark.lerobot
 STATE, SCENE = "observation.state", "observation.environment_state"
@@ -31,10 +30,10 @@ def walk_of(steps: int, seed: int = 0) -> list[dict]:
 def windows(observations, past: int, *, text: str = "go", seed: int = 7, **known) -> list:
     from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
-    glimpses = [StepObservation(o) for o in observations]
+    observations = [StepObservation(o) for o in observations]
     return [
-        DetectorWindow(glimpses[max(n - past, 0) : n + 1], text, n, seed, **known)
-        for n in range(len(glimpses))
+        DetectorWindow(observations[max(n - past, 0) : n + 1], text, n, seed, **known)
+        for n in range(len(observations))
     ]
 
 
@@ -81,7 +80,7 @@ def test_rules_say_what_they_are_for():
     furthest = max(np.linalg.norm(states[k] - states[3]) for k in range(3, 9))
     assert moving[8] == pytest.approx(0.5 / (0.5 + furthest), rel=1e-5)
 
-    outcome = load("oracle").judge_windows(windows(seen[:2], 0, helpless=1.0))
+    outcome = load("oracle").judge_windows(windows(seen[:2], 0, will_fail=1.0))
     assert outcome.triggers.all()
     unknown = load("oracle,truth=recovery_point").judge_windows(windows(seen[:2], 0))
     assert np.isnan(unknown.scores).all()
@@ -122,7 +121,7 @@ def test_distance_from_training_states(method, tmp_path):
     np.testing.assert_array_equal(again.scores, said)
     assert again.triggers.tolist() == [False, False, True]
     cut = {STATE: asked[0][STATE][:3], SCENE: asked[0][SCENE]}
-    with pytest.raises(MonitorError, match="fitted to 10 numbers; here are 9"):
+    with pytest.raises(DetectorError, match="fitted to 10 numbers; here are 9"):
         detector.judge_windows(windows([cut], 0))
 
 
@@ -148,8 +147,8 @@ def test_chunks_that_contradict_each_other():
     line = torch.arange(5.0)
 
     def score(before, now):
-        glimpses = [StepObservation({}, c[:, :, None]) for c in (before, now)]
-        return float(detector.judge_windows([DetectorWindow(glimpses, "go", 1)]).scores[0])
+        observations = [StepObservation({}, c[:, :, None]) for c in (before, now)]
+        return float(detector.judge_windows([DetectorWindow(observations, "go", 1)]).scores[0])
 
     same = line.expand(2, 5)
     assert score(same, same + 1) == pytest.approx(0.0)  # the plan goes on as it was
@@ -166,7 +165,7 @@ def test_chunks_that_contradict_each_other():
         )
         == 0.0
     )
-    with pytest.raises(MonitorError, match=r"lag=1: the policy's chunks have 1 steps.*Set lag below 1"):
+    with pytest.raises(DetectorError, match=r"lag=1: the policy's chunks have 1 steps.*Set lag below 1"):
         score(torch.zeros(2, 1), torch.zeros(2, 1))
 
 
@@ -220,9 +219,9 @@ def test_a_network_on_features_learns_and_comes_back(tmp_path):
     assert said[labels == 1].mean() > 0.7 > 0.4 > said[labels == 0].mean()
     detector.save_pretrained(tmp_path)
     np.testing.assert_array_equal(load(str(tmp_path)).judge_windows(asked).scores, said)
-    with pytest.raises(MonitorError, match="400 frames where the policy goes on by itself and 0"):
+    with pytest.raises(DetectorError, match="400 frames where the policy goes on by itself and 0"):
         load("policy_features").fit(features, torch.zeros(400))
-    with pytest.raises(MonitorError, match="fitted to 8 features; the policy has 3"):
+    with pytest.raises(DetectorError, match="fitted to 8 features; the policy has 3"):
         detector.judge_windows([DetectorWindow([StepObservation({}, None, torch.zeros(3))], "go", 0)])
 
 
@@ -247,7 +246,7 @@ def test_an_expected_gain_is_the_mean_of_what_came_of_it(tmp_path):
     again = load(str(tmp_path))
     np.testing.assert_array_equal(again.judge_windows(asked).scores, said.scores)
     assert (again.config.threshold, again.least_threshold) == (0.0, 0.0)
-    with pytest.raises(MonitorError, match="of 3 forks the intervention rescued none"):
+    with pytest.raises(DetectorError, match="of 3 forks the intervention rescued none"):
         load("recovery_gain").fit(features[:3], -torch.ones(3))
 
 
@@ -276,27 +275,36 @@ def test_step_by_step_it_says_what_it_says_afterwards(kind, probes):
             probe.look([walk[max(n - probe.past, 0) : n + 1]], ["go"], [noise_seed(seed, n)], needs)[0][0]
             for n in range(7)
         ]
-        glimpses = [StepObservation(o, c) for o, c in zip(walk, chunks, strict=True)]
+        observations = [StepObservation(o, c) for o, c in zip(walk, chunks, strict=True)]
         after = detector.judge_windows(
-            [DetectorWindow(glimpses[max(n - 2, 0) : n + 1], "go", n, seed) for n in range(7)]
+            [DetectorWindow(observations[max(n - 2, 0) : n + 1], "go", n, seed) for n in range(7)]
         )
         np.testing.assert_allclose([row[at] for row in live], after.scores, rtol=1e-4, atol=1e-6)
         assert after.scores[6] > 0
 
 
 def test_a_monitor_is_a_detector_that_looks_at_now():
-    from lerobot_roborecover.policies.detectors.interface import as_detector
-
-    monitor = HashMonitor()
-    detector = as_detector(monitor)
-    assert as_detector(detector) is detector
-    assert set(detector.needs.features) == {STATE}
-    assert detector.max_batch == 3
-    seen = walk_of(3)
     import torch
+    from lerobot.configs import FeatureType, PolicyFeature
 
-    own = monitor.judge({STATE: torch.stack([o[STATE] for o in seen])}, ["go"] * 3)
-    np.testing.assert_array_equal(detector.judge_windows(windows(seen, 0)).scores, own.scores)
+    from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor_small import (
+        RoboRecoverMonitorSmallConfig,
+    )
+    from lerobot_roborecover.policies.detectors.monitor.modeling_roborecover_monitor_small import (
+        RoboRecoverMonitorSmallRewardModel,
+    )
+
+    torch.manual_seed(0)
+    config = RoboRecoverMonitorSmallConfig(device="cpu", hidden_dim=8, n_layers=1, max_batch=3)
+    config.input_features = {STATE: PolicyFeature(FeatureType.STATE, (4,))}
+    monitor = RoboRecoverMonitorSmallRewardModel(config).eval()
+    assert set(monitor.needs.features) == {STATE}
+    assert (monitor.max_batch, monitor.decides, monitor.probabilities) == (3, True, True)
+    seen = walk_of(3)
+    own = monitor.judge_batch({STATE: torch.stack([o[STATE] for o in seen]), "task": ["go"] * 3})
+    found = monitor.judge_windows(windows(seen, 2))
+    np.testing.assert_array_equal(found.scores, own.scores)
+    np.testing.assert_array_equal(found.triggers, own.scores > 0.5)
 
 
 @pytest.mark.parametrize(
@@ -316,7 +324,7 @@ def test_a_monitor_is_a_detector_that_looks_at_now():
 )
 def test_options_that_cannot_be_used(what, message, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    with pytest.raises(MonitorError, match=message):
+    with pytest.raises(DetectorError, match=message):
         load(what)
 
 
@@ -328,27 +336,27 @@ def test_what_is_missing_is_said_before_anything_runs(probes):
 
     there = {STATE: PolicyFeature(FeatureType.STATE, (4,))}
     with pytest.raises(
-        MonitorError, match=r"x reads observation.images.top; .* only \['observation.state'\]. Use"
+        DetectorError, match=r"x reads observation.images.top; .* only \['observation.state'\]. Use"
     ):
         check_needs("x", DetectorNeeds(features={"observation.images.top": None}), there, None)
     wanted = {STATE: PolicyFeature(FeatureType.STATE, (3,))}
-    with pytest.raises(MonitorError, match=r"of shape \(3,\); the environment's is \(4,\)"):
+    with pytest.raises(DetectorError, match=r"of shape \(3,\); the environment's is \(4,\)"):
         check_needs("x", DetectorNeeds(features=wanted), there, None)
-    with pytest.raises(MonitorError, match="needs to know the outcome, which is unknown while a trial"):
+    with pytest.raises(DetectorError, match="needs to know the outcome, which is unknown while a trial"):
         check_needs("x", load("oracle").needs, there, None)
     check_needs("x", load("oracle").needs, there, None, ("outcome",))
     with pytest.raises(
-        MonitorError, match="looks into the policy that acts, which is not a LeRobot checkpoint"
+        DetectorError, match="looks into the policy that acts, which is not a LeRobot checkpoint"
     ):
         check_needs("x", DetectorNeeds(chunks=1), there, None)
     check_needs("x", DetectorNeeds(chunks=1, internals=True), there, probes["diffusion"])
     probes["act"].kind, kind = "tdmpc", probes["act"].kind
     try:
         with pytest.raises(
-            MonitorError, match=r"a 'tdmpc' policy gives none beside a trial. It works with \['act'"
+            DetectorError, match=r"a 'tdmpc' policy gives none beside a trial. It works with \['act'"
         ):
             check_needs("x", DetectorNeeds(chunks=1), there, probes["act"])
-        with pytest.raises(MonitorError, match="where a 'tdmpc' policy has them is not known"):
+        with pytest.raises(DetectorError, match="where a 'tdmpc' policy has them is not known"):
             check_needs("x", DetectorNeeds(internals=True), there, probes["act"])
     finally:
         probes["act"].kind = kind

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lerobot_roborecover.policies.interventions.control_columns import append_columns, strip_columns
 from lerobot_roborecover.policies.runner import Act, Controller, PolicyError, Rollback
-from tests.support.small_interventions import CountingMember, ScriptedController, observation
+from tests.support.small_interventions import CountingMember, FrameDetector, ScriptedController, observation
 
 pytestmark = pytest.mark.lerobot
 
@@ -47,13 +47,13 @@ def run_alone(made, values, bad=()):
     return rows[: len(values)], None
 
 
-class At:
+class At(FrameDetector):
     """A monitor that triggers wherever the observation is 9, and cannot be read where it is 8."""
 
     max_batch = 2
 
     def __init__(self):
-        self.input_features = {}
+        super().__init__()
         self.asked = []
 
     def judge(self, observations, instructions):

@@ -17,9 +17,8 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.continuations import Continuation
 from lerobot_roborecover.detection.data.choice import BALANCED, NATURAL, TRAIN, DataOptions, choose
 from lerobot_roborecover.detection.data.data import write_monitor_data
-from lerobot_roborecover.policies.detectors.interface import Monitor
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 from lerobot_roborecover.policies.detectors.loading import load_monitor
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 from tests.support.factories import fake_scenario
 from tests.support.training import lerobot_train
 
@@ -123,11 +122,10 @@ def test_train_save_resume_and_reload(kind, trained, tmp_path, request):
     import torch
 
     monitor = load_monitor(str(saved_to), device="cpu")
-    assert isinstance(monitor, Monitor)
     torch.manual_seed(0)
-    seen = {k: torch.rand(5, *f.shape) for k, f in monitor.input_features.items()}
+    seen = {k: torch.rand(5, *f.shape) for k, f in monitor.needs.features.items()}
     told = ["push the puck to the goal", "x", "push the puck to the goal", "a longer instruction", "y"]
-    together = monitor.judge({**seen, "observation.other": torch.zeros(5, 3)}, told)
+    together = monitor.judge_batch({**seen, "observation.other": torch.zeros(5, 3), "task": told})
     assert together.scores.shape == together.triggers.shape == (5,)
     assert not together.triggers[np.isnan(together.scores)].any()
     answers = monitor.answer({**seen, "task": told})
@@ -228,7 +226,7 @@ def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(base):
             torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
 
     # It can learn: dark pictures are 0, bright ones 1; and what cannot be read becomes readable.
-    before = model.eval().judge(batch, batch["task"])
+    before = model.eval().judge_batch(batch)
     assert np.isnan(before.scores).all()
     assert not before.triggers.any()
     optimizer = torch.optim.AdamW(model.get_optim_params(), lr=1e-2)
@@ -241,7 +239,7 @@ def test_one_backward_over_pieces_is_the_whole_batch_s_gradient(base):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    after = model.eval().judge(batch, batch["task"])
+    after = model.eval().judge_batch(batch)
     assert after.triggers.tolist() == label.bool().tolist()
     assert (after.scores[::2] < 0.5).all()
     assert (after.scores[1::2] > 0.5).all()
@@ -254,8 +252,8 @@ def test_the_small_monitor_reads_what_it_is_told_to(data, tmp_path):
         *kind, f"--reward_model.inputs={ENV_STATE}", f"--output_dir={tmp_path / 'run'}", "--steps=2"
     )
     monitor = load_monitor(str(tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"), device="cpu")
-    assert list(monitor.input_features) == [ENV_STATE]
-    with pytest.raises(MonitorError, match=r"no observation\.images\.wrist .*observation\.state"):
+    assert list(monitor.needs.features) == [ENV_STATE]
+    with pytest.raises(DetectorError, match=r"no observation\.images\.wrist .*observation\.state"):
         lerobot_train(
             *kind,
             "--reward_model.inputs=observation.state,observation.images.wrist",
@@ -296,7 +294,7 @@ def configured(folder: Path, **changes) -> None:
 
 
 def refused(path: Path, words: str, **overrides) -> None:
-    with pytest.raises(MonitorError) as caught:
+    with pytest.raises(DetectorError) as caught:
         load_monitor(str(path), device="cpu", **overrides)
     assert words in str(caught.value), (path, str(caught.value))
 
@@ -305,9 +303,14 @@ def test_what_does_not_fit_is_refused(data, trained, tmp_path):
     import torch
 
     small = final(trained("monitor_small"))
-    with pytest.raises(MonitorError, match=r"shape \(4,\); here it is \(9,\)"):
-        load_monitor(str(small), device="cpu").judge(
-            {STATE: torch.zeros(1, 9), ENV_STATE: torch.zeros(1, 6), CAMERA: torch.zeros(1, 3, 8, 8)}, ["x"]
+    with pytest.raises(DetectorError, match=r"shape \(4,\); here it is \(9,\)"):
+        load_monitor(str(small), device="cpu").judge_batch(
+            {
+                STATE: torch.zeros(1, 9),
+                ENV_STATE: torch.zeros(1, 6),
+                CAMERA: torch.zeros(1, 3, 8, 8),
+                "task": ["x"],
+            }
         )
     changes = [
         (lambda f: (f / "model.safetensors").unlink(), "model.safetensors"),
@@ -319,14 +322,14 @@ def test_what_does_not_fit_is_refused(data, trained, tmp_path):
         refused(damaged(small, tmp_path / str(index), change), words)
     refused(tmp_path, "config.json")
     refused(small, "threshold=1.5", threshold="1.5")
-    with pytest.raises(MonitorError, match="neither a folder nor a Hub model"):
+    with pytest.raises(DetectorError, match="neither a folder nor a Hub model"):
         load_monitor("nobody/nothing")
     # A dataset without labels.
     from lerobot_roborecover.datasets.trajectory_write import write_trajectories
     from tests.datasets.test_trajectories import trajectory
 
     plain = write_trajectories(tmp_path / "plain", "donors", [trajectory(0), trajectory(1)], fps=20)
-    with pytest.raises(MonitorError, match=r"no column next\.reward"):
+    with pytest.raises(DetectorError, match=r"no column next\.reward"):
         lerobot_train(
             *options("monitor_small", data, Path()), f"--dataset.root={plain}",
             f"--output_dir={tmp_path / 'o'}",
@@ -341,8 +344,8 @@ def test_an_adapter_that_does_not_fit_is_refused(trained, tmp_path):
 
     large = final(trained("monitor_qwen3vl"))
     monitor = load_monitor(str(large), device="cpu")
-    with pytest.raises(MonitorError, match=r"reads observation\.image, which the environment does not give"):
-        monitor.judge({"observation.images.top": torch.rand(1, 3, 64, 64)}, ["x"])
+    with pytest.raises(DetectorError, match=r"reads observation\.image, which the environment does not give"):
+        monitor.judge_batch({"observation.images.top": torch.rand(1, 3, 64, 64), "task": ["x"]})
     other = small_qwen3vl(tmp_path / "other", seed=1)
     changes = [
         (lambda f: (f / "adapter_model.safetensors").unlink(), "adapter_model"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 from tests.support.small_qwen3vl import small_qwen3vl
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.slow]
@@ -40,10 +40,10 @@ def ask(detector, seen, steps):
     """What it says at the steps, each with its own history."""
     from lerobot_roborecover.policies.detectors.interface import DetectorWindow, StepObservation
 
-    glimpses = [StepObservation(o) for o in seen]
+    observations = [StepObservation(o) for o in seen]
     past = detector.needs.past
     return detector.judge_windows(
-        [DetectorWindow(glimpses[max(n - past, 0) : n + 1], "push the puck", n) for n in steps]
+        [DetectorWindow(observations[max(n - past, 0) : n + 1], "push the puck", n) for n in steps]
     )
 
 
@@ -166,14 +166,14 @@ def test_what_cannot_be_loaded_is_said_with_what_it_takes(topreward, robometer, 
     config = json.loads((topreward / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**config, "vlm_name": "no-such/model"}))
     with pytest.raises(
-        MonitorError, match=r"needs the model no-such/model with its processor; without a network"
+        DetectorError, match=r"needs the model no-such/model with its processor; without a network"
     ):
         load(str(tmp_path))
     config = json.loads((robometer / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(MonitorError, match="needs its own weights and the tokenizer and image processor of"):
+    with pytest.raises(DetectorError, match="needs its own weights and the tokenizer and image processor of"):
         load(str(tmp_path))
-    with pytest.raises(MonitorError, match="whole numbers"):
+    with pytest.raises(DetectorError, match="whole numbers"):
         load(f"{topreward},lag=soon")
-    with pytest.raises(MonitorError, match="lag=-1"):
+    with pytest.raises(DetectorError, match="lag=-1"):
         load(f"{topreward},lag=-1")

@@ -7,20 +7,41 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_roborecover.policies.detectors.interface import Verdicts
+from lerobot_roborecover.policies.detectors.interface import DetectorNeeds, Verdicts
 from lerobot_roborecover.policies.runner import PolicyError
 
 if TYPE_CHECKING:
     import torch
 
 
-class HashMonitor:
+class FrameDetector:
+    """A detector that looks at the last observation alone, as monitors do; subclasses have `judge`."""
+
+    fitted = decides = probabilities = True
+    trained_on: dict = {}  # noqa: RUF012 - never written
+
+    def __init__(self, keys=()):
+        self.input_features = dict.fromkeys(keys)
+
+    @property
+    def needs(self):
+        return DetectorNeeds(features=self.input_features)
+
+    def judge_windows(self, windows):
+        import torch
+
+        keys = windows[0].observations[-1].observation
+        seen = {k: torch.stack([w.observations[-1].observation[k] for w in windows]) for k in keys}
+        return self.judge(seen, [w.instruction for w in windows])
+
+
+class HashMonitor(FrameDetector):
     """Judges the fake simulator's state by its digits: as good as random, the same wherever it is asked."""
 
     max_batch = 3
 
     def __init__(self, keys=("observation.state",), threshold: float = 0.9):
-        self.input_features = dict.fromkeys(keys)
+        super().__init__(keys)
         self.threshold = threshold
         self.asked = 0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,11 +11,11 @@ from lerobot_roborecover.analysis.stats.monitor import MonitorFrames
 from lerobot_roborecover.datasets.lerobot_folder import open_lerobot_folder
 from lerobot_roborecover.datasets.trajectories import LABEL, ScenarioLink, TrajectorySet, read_trajectories
 from lerobot_roborecover.detection.data.data import STEP, check_disjoint
-from lerobot_roborecover.policies.detectors.monitor.base import TASK, choose_features
+from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel, choose_features
 from lerobot_roborecover.scenario import ScenarioError
 
 
-def check_held_out(monitor: Any, data: TrajectorySet) -> None:
+def check_held_out(monitor: MonitorRewardModel, data: TrajectorySet) -> None:
     """Refuses a dataset that shares scenarios with the monitor's training set.
 
     Raises:
@@ -27,7 +26,7 @@ def check_held_out(monitor: Any, data: TrajectorySet) -> None:
 
 
 def judge_dataset(
-    monitor: Any,
+    monitor: MonitorRewardModel,
     root: Path,
     *,
     num_workers: int = 0,
@@ -41,11 +40,11 @@ def judge_dataset(
         root: folder of a dataset that `roborecover detect data` made.
         num_workers: processes that read frames.
         on_training_scenarios: measure also what the monitor was trained on.
-        on_batch: told how many frames are done of how many.
+        on_batch: called with how many frames are done of how many.
 
     Raises:
         ScenarioError: it is not such a dataset, or holds scenarios that the monitor was trained on.
-        MonitorError: it lacks what the monitor reads.
+        DetectorError: it lacks what the monitor reads.
     """
     import torch
 
@@ -64,7 +63,7 @@ def judge_dataset(
     columns: dict[str, list[np.ndarray]] = {n: [] for n in ("episode", "step", "label", "score", "decision")}
     done = 0
     for batch in loader:
-        verdicts = monitor.judge(batch, batch[TASK])
+        verdicts = monitor.judge_batch(batch)
         steps = batch[STEP] if STEP in batch else batch["frame_index"]
         columns["episode"].append(batch["episode_index"].numpy().reshape(-1))
         columns["step"].append(steps.numpy().reshape(-1).astype(np.int64))

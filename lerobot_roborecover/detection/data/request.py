@@ -77,7 +77,7 @@ def make_monitor_data(request: MonitorRequest, progress: Callable[[str, int, int
 
     Args:
         request: what to make.
-        progress: told of what, how many are done, of how many.
+        progress: called with the step's name, how many are done, and of how many.
 
     Raises:
         OptionError, ScenarioError, SimulatorError, TrialLogError: what cannot be done, and the remedy.

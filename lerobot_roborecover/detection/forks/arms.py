@@ -27,8 +27,6 @@ MAX_BACK = 100_000
 
 @dataclass(frozen=True)
 class ForkArm:
-    """One of them."""
-
     kind: str
     """`continue`, `fresh`, `rollback`, `correction`, `policy` or `human`."""
     value: str = ""

@@ -75,7 +75,7 @@ class ForkRequest:
     slots: int = option(0, name="num-workers", old=("slots",))
     """Simulators at once (as roborecover eval)."""
     max_batch: int = 1
-    """Observations per inference; above 1 a policy's last bits depend on its company."""
+    """Observations per inference; above 1 a policy's last bits depend on the rest of the batch."""
     deterministic: bool = False
     """The policy does the same in every trial: going on is the logged trial, which is not run again (one in
     ten is, to check)."""
@@ -89,8 +89,6 @@ class ForkRequest:
 
 @dataclass(frozen=True)
 class ForkResult:
-    """What came of it."""
-
     log: Path
     rows: tuple[TrialRow, ...]
     """Of the forks that were asked for."""
@@ -106,7 +104,7 @@ def run_forks(
 
     Args:
         request: what is asked for.
-        on_fork: told of each finished one: its arm, and how many are done of how many.
+        on_fork: called with each finished one: its arm, and how many are done of how many.
 
     Raises:
         ScenarioError: the trials cannot be forked: no actions, another set, nothing left.

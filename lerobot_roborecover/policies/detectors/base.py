@@ -1,24 +1,34 @@
-"""Base class of our own detectors: a LeRobot reward model whose reward is the score."""
+"""Base class of our own detectors, monitors among them: LeRobot reward models."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lerobot_roborecover.policies.detectors.interface import DetectorNeeds, DetectorWindow, Verdicts, batch_of
-from lerobot_roborecover.policies.detectors.monitor.base import TRAINED_ON_FILE
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor.files import WEIGHTS_FILE, find_file, read_trained_on
+from lerobot_roborecover.policies.detectors.files import (
+    TRAINED_ON_FILE,
+    WEIGHTS_FILE,
+    find_file,
+    read_trained_on,
+)
+from lerobot_roborecover.policies.detectors.interface import (
+    DetectorError,
+    DetectorNeeds,
+    DetectorWindow,
+    Verdicts,
+    batch_of,
+)
 
 PREFIX = "roborecover_"
 """Of our reward-model types; a detector's kind is what follows."""
@@ -40,14 +50,26 @@ class DetectorConfig(RewardModelConfig):
         """Refuses values that cannot be used.
 
         Raises:
-            MonitorError: naming the option, its value and its limit.
+            DetectorError: naming the option, its value and its limit.
         """
 
-    def refuse(self, name: str, limit: str) -> MonitorError:
+    def refuse(self, name: str, limit: str) -> DetectorError:
         """The refusal of an option's value."""
-        return MonitorError(
+        return DetectorError(
             f"{self.type.removeprefix(PREFIX)}, {name}={getattr(self, name)}: must be {limit}"
         )
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a detector answers for a batch of B."""
+
+    scores: Tensor
+    """(B,) float32; from monitors the probability of label 1, in [0, 1]."""
+    decisions: Tensor
+    """(B,) bool: intervene. Never True where the answer could not be read."""
+    parsed: Tensor
+    """(B,) bool: the answer could be read."""
 
 
 class DetectorRewardModel(PreTrainedRewardModel):
@@ -59,44 +81,68 @@ class DetectorRewardModel(PreTrainedRewardModel):
     config: Any
     fitted: bool = True
     """Whether it can be asked: False for one that has to be fitted first, and has not been."""
+    probabilities: bool = False
+    """Whether its scores are probabilities."""
     least_threshold: float = -math.inf
     """Below it no threshold is set, whatever the rate of false alarms that is allowed."""
 
     def __init__(self, config: Any, **_: Any):
-        config.check()
+        if isinstance(config, DetectorConfig):
+            config.check()
         super().__init__(config)
         self.trained_on: dict[str, Any] = {}
-        """Scenarios that it was fitted on, as monitors record them; empty where it was fitted on none."""
+        """What `TRAINED_ON_FILE` holds; empty where it was fitted on none, or it is not known."""
 
     @property
     def needs(self) -> DetectorNeeds:
         raise NotImplementedError
 
     @property
-    def input_features(self) -> Mapping[str, Any]:
-        """Observation keys that it reads."""
-        return self.needs.features
-
-    @property
     def max_batch(self) -> int:
         """Windows that it can judge at once."""
         return self.config.max_batch
 
+    @property
+    def decides(self) -> bool:
+        """Whether it triggers by itself."""
+        return self.config.threshold is not None
+
+    def answer(self, batch: dict[str, Any]) -> Answers:
+        """Scores and decisions of a batch, without gradients kept."""
+        scores = self.compute_reward(batch).float()
+        parsed = ~scores.isnan()
+        threshold = self.config.threshold
+        above = torch.zeros_like(parsed) if threshold is None else scores > threshold
+        return Answers(scores, above & parsed, parsed)
+
     @torch.inference_mode()
     def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
-        """Scores, and which of them are above the threshold."""
-        scores = self.compute_reward(batch_of(windows, self.needs)).float().cpu().numpy()
-        threshold = self.config.threshold
-        with_help = scores > threshold if threshold is not None else scores != scores
-        return Verdicts(scores=scores, triggers=with_help & (scores == scores))
+        """Scores, and which of them trigger."""
+        return self.judge_batch(batch_of(windows, self.needs))
+
+    @torch.inference_mode()
+    def judge_batch(self, batch: dict[str, Any]) -> Verdicts:
+        """Scores, and which of them trigger.
+
+        Args:
+            batch: as of `interface.batch_of`, or a batch of a LeRobot dataset for a monitor.
+        """
+        answers = self.answer(batch)
+        scores = answers.scores.float().cpu().numpy().copy()
+        scores[~answers.parsed.cpu().numpy()] = np.nan
+        return Verdicts(scores=scores, triggers=answers.decisions.cpu().numpy())
 
     def _save_pretrained(self, save_directory: Path) -> None:
         self.config._save_pretrained(save_directory)
-        state = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
-        if state:
-            save_file(state, save_directory / WEIGHTS_FILE)
+        self.save_weights(save_directory)
         if self.trained_on:
             (save_directory / TRAINED_ON_FILE).write_text(json.dumps(self.trained_on, indent=1) + "\n")
+
+    def save_weights(self, folder: Path) -> None:
+        """Writes `model.safetensors`, if there is anything in it."""
+        state = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
+        if state:
+            save_file(state, folder / WEIGHTS_FILE)
 
     @classmethod
     def from_pretrained(
@@ -110,7 +156,7 @@ class DetectorRewardModel(PreTrainedRewardModel):
         """Loads a fitted detector from a folder or the Hub.
 
         Raises:
-            MonitorError: its weights are missing or do not fit.
+            DetectorError: its weights are missing or do not fit.
         """
         if config is None:
             config = RewardModelConfig.from_pretrained(pretrained_name_or_path, revision=revision)

@@ -25,7 +25,6 @@ class RoboRecoverConstantConfig(DetectorConfig):
             self.threshold = 1.0 - self.rate
 
     def check(self) -> None:
-        """A rate from 0 to 1."""
         if not 0.0 <= self.rate <= 1.0:
             raise self.refuse("rate", "from 0 to 1")
 
@@ -78,6 +77,5 @@ class RoboRecoverOracleConfig(DetectorConfig):
     threshold: float | None = 0.5
 
     def check(self) -> None:
-        """A truth that there is."""
         if self.truth not in TRUTHS:
             raise self.refuse("truth", " or ".join(TRUTHS))

@@ -8,10 +8,10 @@ Contract for implementations:
   the acting policy, the policy's features, or a ground truth that is unknown while a trial runs.
 - A higher score means that failure is more likely. A score of NaN means no answer, and never triggers.
 
-A recovery monitor (`Monitor`) scores one observation at a time; `MonitorDetector` makes it a detector. It is
-called at every environment step after the handoff, the handoff's own observation included, until its first
-trigger in the trial; never on replayed actions (paper, "Monitor Training and Triggering"). An answer that
-cannot be read is a NaN score, and the trial row counts it.
+A recovery monitor is a detector that looks at the last observation alone. It is called at every environment
+step after the handoff, the handoff's own observation included, until its first trigger in the trial; never on
+replayed actions (paper, "Monitor Training and Triggering"). An answer that cannot be read is a NaN score, and
+the trial row counts it.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+
+from lerobot_roborecover.errors import OptionError
 
 if TYPE_CHECKING:
     import torch
@@ -42,7 +44,7 @@ SEED = "roborecover.seed"
 """Batch key: (B,) int64, the trial's."""
 DEVIATED = "roborecover.deviated"
 """Batch key: (B,) float32, 1 from the recovery point on; NaN where unknown."""
-WILL_FAIL = "roborecover.helpless"
+WILL_FAIL = "roborecover.will_fail"
 """Batch key: (B,) float32, 1 where the policy does not recover by itself; NaN where unknown."""
 
 
@@ -59,7 +61,7 @@ class DetectorNeeds:
     internals: bool = False
     """The acting policy's own features."""
     truth: str = ""
-    """`recovery_point` or `outcome`: known only to who evaluates."""
+    """`recovery_point` or `outcome`: known only in an evaluation."""
 
     @property
     def of_policy(self) -> bool:
@@ -83,7 +85,7 @@ class StepObservation:
 class DetectorWindow:
     """The steps that a detector scores at once."""
 
-    glimpses: Sequence[StepObservation]
+    observations: Sequence[StepObservation]
     """From the oldest to now; as many as the detector looks back at and one, fewer where the watch has just
     begun."""
     instruction: str
@@ -93,13 +95,13 @@ class DetectorWindow:
     """The trial's."""
     deviated: float = math.nan
     """1 from the recovery point on, 0 before it; NaN where unknown."""
-    helpless: float = math.nan
+    will_fail: float = math.nan
     """1 where the policy does not recover by itself, 0 where it does; NaN where unknown."""
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What a detector says of B windows, or a monitor of B observations."""
+    """What a detector says of B windows."""
 
     scores: np.ndarray
     """(B,) float32: how far the execution has gone wrong, from monitors in [0, 1], from other detectors on
@@ -108,9 +110,24 @@ class Verdicts:
     """(B,) bool: intervene now. Never True where the score is NaN."""
 
 
-@runtime_checkable
+class DetectorError(OptionError):
+    """A detector cannot be built, loaded, fitted or asked; the message names the value and the remedy."""
+
+
 class Detector(Protocol):
     """Scores windows: a higher score means that failure is more likely."""
+
+    @property
+    def trained_on(self) -> Mapping[str, Any]:
+        """`scenarios`: hashes by id of those that it was trained on; empty where they are not known."""
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it can be asked: False for one that has to be fitted first, and has not been."""
+
+    @property
+    def probabilities(self) -> bool:
+        """Whether its scores are probabilities."""
 
     @property
     def needs(self) -> DetectorNeeds:
@@ -120,73 +137,12 @@ class Detector(Protocol):
     def max_batch(self) -> int:
         """Windows that it can judge at once."""
 
+    @property
+    def decides(self) -> bool:
+        """Whether it triggers by itself; False for one without a threshold."""
+
     def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
         """Returns scores, and alarms at the detector's own threshold; none without a threshold."""
-
-
-@runtime_checkable
-class Monitor(Protocol):
-    """Says of each observation whether execution has gone wrong."""
-
-    input_features: Mapping[str, Any]
-    """What it reads, by LeRobot key (`observation.images.image`, `observation.state`, ...), as
-    `PolicyFeature`s. A key the environment does not give is refused before the first trial."""
-    max_batch: int
-    """Observations it can judge at once."""
-
-    def judge(self, observations: Mapping[str, torch.Tensor], instructions: Sequence[str]) -> Verdicts:
-        """Judges a batch.
-
-        Args:
-            observations: as they leave the env preprocessor, before any policy's own preprocessor: LeRobot
-                keys, batch axis first; pictures (B, 3, H, W) float32 in [0, 1], vectors (B, n) float32. May
-                hold more keys than it reads.
-            instructions: B language instructions.
-        """
-
-
-@runtime_checkable
-class TrainedMonitor(Monitor, Protocol):
-    """A monitor that knows what it was trained on, as all of ours do."""
-
-    config: Any
-    """Of LeRobot's reward model."""
-    trained_on: Mapping[str, Any]
-    """Scenarios and labels of the training set; empty where they are not known."""
-
-
-class MonitorDetector:
-    """A monitor as a detector: it looks at the last observation alone.
-
-    Args:
-        monitor: of `loading.load_monitor`.
-    """
-
-    def __init__(self, monitor: Monitor):
-        self.monitor = monitor
-
-    @property
-    def needs(self) -> DetectorNeeds:
-        """The observations that the monitor reads."""
-        return DetectorNeeds(features=self.monitor.input_features)
-
-    @property
-    def max_batch(self) -> int:
-        """The monitor's."""
-        return self.monitor.max_batch
-
-    def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
-        """The monitor's own answers."""
-        import torch
-
-        keys = windows[0].glimpses[-1].observation
-        seen = {k: torch.stack([w.glimpses[-1].observation[k] for w in windows]) for k in keys}
-        return self.monitor.judge(seen, [w.instruction for w in windows])
-
-
-def as_detector(judge: Detector | Monitor) -> Detector:
-    """A detector, or a monitor as one."""
-    return judge if isinstance(judge, Detector) else MonitorDetector(judge)
 
 
 class DetectorHistory:
@@ -198,23 +154,23 @@ class DetectorHistory:
     """
 
     def __init__(self, past: int, seed: int | None):
-        self._glimpses: deque[StepObservation] = deque(maxlen=past + 1)
+        self._observations: deque[StepObservation] = deque(maxlen=past + 1)
         self._step, self._seed, self._instruction = -1, seed or 0, ""
 
-    def show(self, glimpse: StepObservation, instruction: str) -> DetectorWindow:
+    def show(self, observation: StepObservation, instruction: str) -> DetectorWindow:
         """The window that ends with this step."""
-        self._glimpses.append(glimpse)
+        self._observations.append(observation)
         self._step += 1
         self._instruction = instruction
         return self._window()
 
     def amend(self, chunks: torch.Tensor | None, features: torch.Tensor | None) -> DetectorWindow:
         """The same window, its last step with what the policy would do and computes there."""
-        self._glimpses[-1] = StepObservation(self._glimpses[-1].observation, chunks, features)
+        self._observations[-1] = StepObservation(self._observations[-1].observation, chunks, features)
         return self._window()
 
     def _window(self) -> DetectorWindow:
-        return DetectorWindow(tuple(self._glimpses), self._instruction, self._step, self._seed)
+        return DetectorWindow(tuple(self._observations), self._instruction, self._step, self._seed)
 
 
 def batch_of(windows: Sequence[DetectorWindow], needs: DetectorNeeds) -> dict[str, Any]:
@@ -230,12 +186,12 @@ def batch_of(windows: Sequence[DetectorWindow], needs: DetectorNeeds) -> dict[st
     batch: dict[str, Any] = {
         TASK: [w.instruction for w in windows],
         STEP: torch.tensor([w.step for w in windows]),
-        SEEN: torch.tensor([len(w.glimpses) for w in windows]),
+        SEEN: torch.tensor([len(w.observations) for w in windows]),
         SEED: torch.tensor([w.seed for w in windows]),
         DEVIATED: torch.tensor([w.deviated for w in windows], dtype=torch.float32),
-        WILL_FAIL: torch.tensor([w.helpless for w in windows], dtype=torch.float32),
+        WILL_FAIL: torch.tensor([w.will_fail for w in windows], dtype=torch.float32),
     }
-    rows = [_padded(w.glimpses, needs.past) for w in windows]
+    rows = [_padded(w.observations, needs.past) for w in windows]
     for key in needs.features:
         if needs.past:
             batch[key] = torch.stack([torch.stack([g.observation[key] for g in row]) for row in rows])
@@ -248,8 +204,8 @@ def batch_of(windows: Sequence[DetectorWindow], needs: DetectorNeeds) -> dict[st
     return batch
 
 
-def _padded(glimpses: Sequence[StepObservation], past: int) -> list[StepObservation]:
-    row = list(glimpses[-(past + 1) :])
+def _padded(observations: Sequence[StepObservation], past: int) -> list[StepObservation]:
+    row = list(observations[-(past + 1) :])
     return [row[0]] * (past + 1 - len(row)) + row
 
 

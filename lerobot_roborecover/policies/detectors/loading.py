@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.policies.detectors.base import PREFIX, DetectorRewardModel
-from lerobot_roborecover.policies.detectors.interface import Detector, DetectorNeeds, Monitor, as_detector
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor.files import CONFIG_FILE, find_file
+from lerobot_roborecover.policies.detectors.files import CONFIG_FILE, find_file
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorError, DetectorNeeds
+from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.detectors.progress import (
     PROGRESS_TYPES,
@@ -30,7 +30,7 @@ def split_options(text: str) -> tuple[str, dict[str, str]]:
     """`WHAT,name=value,...`: what, and its options. A folder whose name holds commas is taken as it stands.
 
     Raises:
-        MonitorError: an option without a name or a value.
+        DetectorError: an option without a name or a value.
     """
     if Path(text).exists():
         return text, {}
@@ -43,7 +43,7 @@ def split_options(text: str) -> tuple[str, dict[str, str]]:
             options[last] += f",{part}"
             continue
         if not equals or not name.strip():
-            raise MonitorError(f"--detector {text}: {part!r} is no option. Write {what},name=value")
+            raise DetectorError(f"--detector {text}: {part!r} is no option. Write {what},name=value")
         last = name.strip()
         options[last] = value
     return what, options
@@ -63,7 +63,7 @@ def load_detector(
         overrides: more options, which win.
 
     Raises:
-        MonitorError: it is not there, or an option is none of its.
+        DetectorError: it is not there, or an option is none of its.
     """
     from lerobot_roborecover.policies.detectors import register_detectors
     from lerobot_roborecover.policies.detectors.monitor import register_monitors
@@ -84,16 +84,16 @@ def load_detector(
         cls = _class(kind)
         return cls.from_pretrained(head, config=config, revision=revision)
     try:
-        return as_detector(load_monitor(head, device, revision=revision, **options))
-    except MonitorError as err:
+        return load_monitor(head, device, revision=revision, **options)
+    except DetectorError as err:
         if kind:
             raise
-        raise MonitorError(f"{err}. Kinds that need no checkpoint: {', '.join(KINDS)}") from None
+        raise DetectorError(f"{err}. Kinds that need no checkpoint: {', '.join(KINDS)}") from None
 
 
 def load_monitor(
     path: str, device: str | None = None, revision: str | None = None, **overrides: str
-) -> Monitor:
+) -> MonitorRewardModel:
     """Loads a monitor by LeRobot's own registry of reward models.
 
     Args:
@@ -103,7 +103,7 @@ def load_monitor(
         overrides: other values of its config, e.g. `threshold="0.7"` or `base_model=FOLDER`.
 
     Raises:
-        MonitorError: it is not there, is not a monitor, or lacks a part.
+        DetectorError: it is not there, is not a monitor, or lacks a part.
     """
     from lerobot.configs.rewards import RewardModelConfig
 
@@ -116,23 +116,18 @@ def load_monitor(
     try:
         kind = json.loads(file.read_text()).get("type")
     except (ValueError, AttributeError) as err:
-        raise MonitorError(f"{file} is not a checkpoint's configuration ({err})") from None
+        raise DetectorError(f"{file} is not a checkpoint's configuration ({err})") from None
     if kind not in RewardModelConfig.get_known_choices():
         known = sorted(k for k in RewardModelConfig.get_known_choices() if k.startswith(PREFIX))
-        raise MonitorError(f"{path} is a checkpoint of type {kind!r}; a monitor is one of {known}")
+        raise DetectorError(f"{path} is a checkpoint of type {kind!r}; a monitor is one of {known}")
     config = _config(path, revision, device, overrides)
     cls: Any = _class(config.type)
-    other = MonitorError(
-        f"{path} is a reward model of type {config.type!r}, which does not judge single frames as a "
-        "monitor does; train one with policies/train/monitor_qwen3vl.yaml or monitor_small.yaml"
-    )
-    if not hasattr(cls, "judge"):  # before it is loaded
-        raise other
-    model = cls.from_pretrained(path, config=config, revision=revision)
-    model.eval()
-    if not isinstance(model, Monitor):
-        raise other
-    return model
+    if not issubclass(cls, MonitorRewardModel):
+        raise DetectorError(
+            f"{path} is a reward model of type {config.type!r}, which does not judge single frames as a "
+            "monitor does; train one with policies/train/monitor_qwen3vl.yaml or monitor_small.yaml"
+        )
+    return cls.from_pretrained(path, config=config, revision=revision).eval()
 
 
 def check_needs(
@@ -152,7 +147,7 @@ def check_needs(
         truths: ground truths that the caller knows.
 
     Raises:
-        MonitorError: naming what is missing, what there is, and the remedy.
+        DetectorError: naming what is missing, what there is, and the remedy.
     """
     for key, feature in needs.features.items():
         if key not in features:
@@ -162,24 +157,24 @@ def check_needs(
                 if key.startswith("observation.image")
                 else "See --env.obs_type, or name other keys (keys=...)"
             )
-            raise MonitorError(
+            raise DetectorError(
                 f"{name} reads {key}; the environment gives no {key}, only {sorted(features)}. {remedy}"
             )
         own, there = getattr(feature, "shape", None), getattr(features[key], "shape", None)
         vector = own is not None and there is not None and len(own) == 1
         if vector and tuple(own) != tuple(there):
-            raise MonitorError(
+            raise DetectorError(
                 f"{name} reads {key} of shape {tuple(own)}; the environment's is {tuple(there)}. Use a "
                 "detector of this platform"
             )
     if needs.truth and needs.truth not in truths:
-        raise MonitorError(
+        raise DetectorError(
             f"{name} needs to know the {needs.truth.replace('_', ' ')}, which is unknown while a trial "
             "runs; it can be measured (`roborecover detect evaluate --detector oracle`), not used"
         )
     if needs.of_policy:
         if probe is None:
-            raise MonitorError(
+            raise DetectorError(
                 f"{name} looks into the policy that acts, which is not a LeRobot checkpoint in this process. "
                 "Use one, or a detector that reads observations alone"
             )
@@ -196,13 +191,13 @@ def _made(kind: str, device: str | None, options: Mapping[str, str]) -> Detector
     unknown = sorted(set(options) - fields)
     if unknown:
         own = sorted(fields - set(RewardModelConfig.__dataclass_fields__))
-        raise MonitorError(f"detector {kind}: no option {unknown[0]!r}; it has {own}")
+        raise DetectorError(f"detector {kind}: no option {unknown[0]!r}; it has {own}")
     given = [f"--{k}={v}" for k, v in options.items()]
     given += [f"--device={device}"] if device else []
     try:
         config = draccus.parse(cls, args=given)
     except (DecodingError, ParsingError, ValueError) as err:
-        raise MonitorError(f"detector {kind}: {_reason(err)}") from None
+        raise DetectorError(f"detector {kind}: {_reason(err)}") from None
     return _class(PREFIX + kind)(config)
 
 
@@ -217,7 +212,7 @@ def _type_of(path: str, revision: str | None) -> str:
     try:
         file = find_file(path, CONFIG_FILE, revision)
         return str(json.loads(file.read_text()).get("type"))
-    except (MonitorError, ValueError, AttributeError):
+    except (DetectorError, ValueError, AttributeError):
         return ""  # the monitors' loader says what is wrong with it
 
 
@@ -230,9 +225,9 @@ def _config(path: str, revision: str | None, device: str | None, options: Mappin
     try:
         config = RewardModelConfig.from_pretrained(path, revision=revision, cli_overrides=given)
     except (DecodingError, ParsingError, OSError, ValueError) as err:
-        raise MonitorError(f"{path}, with {dict(options) or 'no options'}: {_reason(err)}") from None
+        raise DetectorError(f"{path}, with {dict(options) or 'no options'}: {_reason(err)}") from None
     except SystemExit:
-        raise MonitorError(f"{path}: options {dict(options)} are not all of its") from None
+        raise DetectorError(f"{path}: options {dict(options)} are not all of its") from None
     config.pretrained_path = str(path)
     return config
 
@@ -243,9 +238,9 @@ def _progress_options(given: Mapping[str, str]) -> ProgressOptions:
             **{k: float(v) if k == "threshold" else int(v) for k, v in given.items()}  # ty: ignore
         )
     except ValueError as err:
-        if isinstance(err, MonitorError):
+        if isinstance(err, DetectorError):
             raise
-        raise MonitorError(f"{dict(given)}: lag, stride and max_batch are whole numbers ({err})") from None
+        raise DetectorError(f"{dict(given)}: lag, stride and max_batch are whole numbers ({err})") from None
 
 
 def _reason(err: BaseException) -> str:

@@ -14,8 +14,13 @@ from lerobot_roborecover.policies.detectors.configuration_policy import (
     RoboRecoverPolicyFeaturesConfig,
     RoboRecoverRecoveryGainConfig,
 )
-from lerobot_roborecover.policies.detectors.interface import CHUNKS, FEATURES, SEEN, DetectorNeeds
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import (
+    CHUNKS,
+    FEATURES,
+    SEEN,
+    DetectorError,
+    DetectorNeeds,
+)
 
 
 class RoboRecoverChunkDisagreementRewardModel(DetectorRewardModel):
@@ -38,12 +43,12 @@ class RoboRecoverChunkDisagreementRewardModel(DetectorRewardModel):
         """(B,) distances per planned step, in the policy's normalised units; 0 until `lag` steps were seen.
 
         Raises:
-            MonitorError: chunks are no longer than the lag.
+            DetectorError: chunks are no longer than the lag.
         """
         chunks, lag = batch[CHUNKS].float(), self.config.lag
         length = chunks.shape[3]
         if length <= lag:
-            raise MonitorError(
+            raise DetectorError(
                 f"chunk_disagreement, lag={lag}: the policy's chunks have {length} steps, and two that are "
                 f"{lag} steps apart share none. Set lag below {length}"
             )
@@ -81,7 +86,7 @@ class FeatureNetwork(DetectorRewardModel):
         try:
             self.load_state_dict(weights())
         except RuntimeError as err:
-            raise MonitorError(f"{self._kind}: weights do not fit config.json: {err}") from None
+            raise DetectorError(f"{self._kind}: weights do not fit config.json: {err}") from None
         self.fitted = True
 
     @property
@@ -138,11 +143,11 @@ class FeatureNetwork(DetectorRewardModel):
         """(B,) expected targets.
 
         Raises:
-            MonitorError: it has not been fitted, or to another policy's features.
+            DetectorError: it has not been fitted, or to another policy's features.
         """
         features = batch[FEATURES].float()
         if not self.fitted or features.shape[1] != self.config.width:
-            raise MonitorError(
+            raise DetectorError(
                 f"{self._kind} was fitted to {self.config.width} features; the policy has "
                 f"{features.shape[1]}. Fit it to this policy"
             )
@@ -154,6 +159,7 @@ class RoboRecoverPolicyFeaturesRewardModel(FeatureNetwork):
 
     config_class = RoboRecoverPolicyFeaturesConfig
     name = "roborecover_policy_features"
+    probabilities = True
 
     def fit(self, features: Tensor, labels: Tensor) -> float:
         """Trains it; both labels weigh the same.
@@ -166,11 +172,11 @@ class RoboRecoverPolicyFeaturesRewardModel(FeatureNetwork):
             The last hundred steps' mean loss.
 
         Raises:
-            MonitorError: one of the labels is missing.
+            DetectorError: one of the labels is missing.
         """
         counts = [int((labels == v).sum()) for v in (0, 1)]
         if not all(counts):
-            raise MonitorError(
+            raise DetectorError(
                 f"policy_features: {counts[0]} frames where the policy goes on by itself and {counts[1]} "
                 "where it does not; both are needed to learn from. Fit on more scenarios (--fit-split)"
             )
@@ -182,7 +188,7 @@ class RoboRecoverPolicyFeaturesRewardModel(FeatureNetwork):
         """(B,) probabilities.
 
         Raises:
-            MonitorError: it has not been fitted, or to another policy's features.
+            DetectorError: it has not been fitted, or to another policy's features.
         """
         return self._means(batch)
 
@@ -205,12 +211,12 @@ class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
             The last hundred steps' mean loss.
 
         Raises:
-            MonitorError: the intervention rescued no trial.
+            DetectorError: the intervention rescued no trial.
         """
         counts = {"rescued": gains > 0, "harmed": gains < 0, "alike": gains == 0}
         self.config.labels = {name: int(rows.sum()) for name, rows in counts.items()}
         if not self.config.labels["rescued"]:
-            raise MonitorError(
+            raise DetectorError(
                 f"recovery_gain: of {len(gains)} forks the intervention rescued none "
                 f"({self.config.labels['harmed']} harmed), so there is no gain to learn. Fork more trials "
                 "(roborecover detect fork --stride), or with another --arm"
@@ -221,6 +227,6 @@ class RoboRecoverRecoveryGainRewardModel(FeatureNetwork):
         """(B,) expected gains.
 
         Raises:
-            MonitorError: it has not been fitted, or to another policy's features.
+            DetectorError: it has not been fitted, or to another policy's features.
         """
         return 2 * self._means(batch) - 1

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from lerobot_roborecover.policies.detectors.base import DetectorRewardModel
 from lerobot_roborecover.policies.detectors.configuration_states import RoboRecoverStateDistanceConfig
-from lerobot_roborecover.policies.detectors.interface import TASK, DetectorNeeds
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import TASK, DetectorError, DetectorNeeds
 
 _STILL = 1e-6
 """Standard deviation below which a number never changes in training; it is compared as it is."""
@@ -53,11 +52,11 @@ class RoboRecoverStateDistanceRewardModel(DetectorRewardModel):
             instructions: N.
 
         Raises:
-            MonitorError: too few of them, or one is not finite.
+            DetectorError: too few of them, or one is not finite.
         """
         states = torch.cat([observations[k].flatten(1).float() for k in self.config.key_list], dim=1)
         if len(states) <= self.config.k or not torch.isfinite(states).all():
-            raise MonitorError(
+            raise DetectorError(
                 f"state_distance: {len(states)} training states, {int((~torch.isfinite(states)).sum())} "
                 f"numbers in them not finite; it takes more than k={self.config.k}, all finite"
             )
@@ -84,10 +83,10 @@ class RoboRecoverStateDistanceRewardModel(DetectorRewardModel):
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """(B,) distances, divided by the root of the width: of order 1 within the training states."""
         if not self.fitted:
-            raise MonitorError("state_distance has not been fitted to training states")
+            raise DetectorError("state_distance has not been fitted to training states")
         states = torch.cat([batch[k].flatten(1).float() for k in self.config.key_list], dim=1)
         if states.shape[1] != self.states.shape[1]:
-            raise MonitorError(
+            raise DetectorError(
                 f"state_distance was fitted to {self.states.shape[1]} numbers; here are {states.shape[1]}. "
                 "Fit it to this environment's states"
             )

@@ -61,7 +61,7 @@ class OnlineDetector:
             windows.append(watch.show(StepObservation(observation), text))
         if self._probe is not None:
             looks = self._probe.look(
-                [[g.observation for g in w.glimpses] for w in windows],
+                [[g.observation for g in w.observations] for w in windows],
                 instructions,
                 [noise_seed(w.seed, w.step) for w in windows],
                 self._needs,

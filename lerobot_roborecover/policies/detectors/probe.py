@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_roborecover.policies.detectors.interface import DetectorNeeds
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError, DetectorNeeds
 from lerobot_roborecover.policies.local_runner import STATELESS
 
 FEATURE_MODULES: Mapping[str, str] = {
@@ -60,16 +59,16 @@ class PolicyProbe:
         """Refuses what this policy cannot show.
 
         Raises:
-            MonitorError: naming the detector, the policy type and the types that can.
+            DetectorError: naming the detector, the policy type and the types that can.
         """
         chunks = sorted({*STATELESS, *_QUEUED})
         if needs.chunks and self.kind not in chunks:
-            raise MonitorError(
+            raise DetectorError(
                 f"{name} needs the policy's action chunks; a {self.kind!r} policy gives none beside a trial. "
                 f"It works with {chunks}"
             )
         if needs.internals and self.kind not in FEATURE_MODULES:
-            raise MonitorError(
+            raise DetectorError(
                 f"{name} needs the policy's own features; where a {self.kind!r} policy has them is not known "
                 f"(interventions/detectors/probe.py). It works with {sorted(FEATURE_MODULES)}"
             )

@@ -24,12 +24,12 @@ from torch import Tensor
 from lerobot_roborecover.policies.detectors.interface import (
     SEEN,
     TASK,
+    DetectorError,
     DetectorNeeds,
     DetectorWindow,
     Verdicts,
     batch_of,
 )
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
 
 PROGRESS_TYPES = ("sarm", "robometer", "topreward")
 _EXTRAS = "pip install 'lerobot_env_roborecover[rewards]'"
@@ -50,7 +50,7 @@ class ProgressOptions:
 
     def __post_init__(self):
         if self.lag < 0 or self.stride < 1 or self.max_batch < 1:
-            raise MonitorError(
+            raise DetectorError(
                 f"lag={self.lag}, stride={self.stride}, max_batch={self.max_batch}: lag from 0, the others "
                 "from 1"
             )
@@ -75,6 +75,7 @@ class ProgressDetector:
             features[config.state_key] = None
         self._needs = DetectorNeeds(features=features, past=-min(self._frames) + options.lag)
         self.trained_on: Mapping[str, Any] = {}
+        self.fitted, self.probabilities = True, False
 
     @property
     def needs(self) -> DetectorNeeds:
@@ -85,6 +86,10 @@ class ProgressDetector:
     def max_batch(self) -> int:
         """Windows that it can judge at once."""
         return self.options.max_batch
+
+    @property
+    def decides(self) -> bool:
+        return self.options.threshold is not None
 
     @torch.no_grad()
     def judge_windows(self, windows: Sequence[DetectorWindow]) -> Verdicts:
@@ -139,7 +144,7 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
         options: how its reward becomes a score.
 
     Raises:
-        MonitorError: a part of it is neither here nor to be had, or a package is missing.
+        DetectorError: a part of it is neither here nor to be had, or a package is missing.
     """
     from lerobot.rewards import get_reward_model_class
     from lerobot.rewards.factory import make_reward_pre_post_processors
@@ -148,9 +153,11 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
         model = get_reward_model_class(config.type).from_pretrained(path, config=config, revision=revision)
         pre, _ = make_reward_pre_post_processors(config)
     except ImportError as err:
-        raise MonitorError(f"{path}: a {config.type} reward model needs a package: {err}. {_EXTRAS}") from err
+        raise DetectorError(
+            f"{path}: a {config.type} reward model needs a package: {err}. {_EXTRAS}"
+        ) from err
     except (OSError, ValueError) as err:
-        raise MonitorError(
+        raise DetectorError(
             f"{path}: the {config.type} reward model cannot be loaded ({str(err)[:300]}). It needs "
             f"{_parts(config)}; without a network these must be in the Hub's cache already (`hf download`)"
         ) from err

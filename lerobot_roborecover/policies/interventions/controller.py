@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_roborecover.policies.detectors.interface import Detector, DetectorHistory, Monitor, as_detector
+from lerobot_roborecover.policies.detectors.interface import Detector, DetectorHistory
 from lerobot_roborecover.policies.detectors.online import OnlineDetector
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
 from lerobot_roborecover.policies.interventions.members import MemberHost
@@ -62,7 +62,7 @@ class InterventionController:
     Args:
         members: the policies by controller; includes `Controller.BASE`.
         mode: of the composite policy.
-        monitor: a monitor or any other detector, which decides when; None intervenes at the recovery point.
+        monitor: the detector that decides when; None intervenes at the recovery point.
         probe: into the base policy, for a detector that looks into it.
         takeover: the person, for mode `human`.
         correction_steps: of the correction policy.
@@ -74,7 +74,7 @@ class InterventionController:
         members: Mapping[Controller, MemberHost],
         mode: str,
         *,
-        monitor: Monitor | Detector | None = None,
+        monitor: Detector | None = None,
         probe: PolicyProbe | None = None,
         takeover: TakeoverController | None = None,
         correction_steps: int = 30,
@@ -82,7 +82,7 @@ class InterventionController:
     ):
         self.members = dict(members)
         self._mode, self._takeover = mode, takeover
-        self._watcher = None if monitor is None else OnlineDetector(as_detector(monitor), probe)
+        self._watcher = None if monitor is None else OnlineDetector(monitor, probe)
         self._correction_steps = correction_steps
         self._rewind_steps = rewind_steps
         self.action_width = self.members[Controller.BASE].action_width

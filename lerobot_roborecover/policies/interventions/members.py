@@ -44,7 +44,6 @@ class MemberHost(LocalPolicyRunner):
 
     @property
     def action_width(self) -> int:
-        """A: width of its actions."""
         return int(self._config.output_features[ACTION].shape[0])
 
     def _prepare(self, observations: Sequence[Mapping[str, Any]], instructions: Sequence[str]) -> Any:

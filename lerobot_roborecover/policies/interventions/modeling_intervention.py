@@ -13,10 +13,8 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.policies.detectors.base import DetectorRewardModel
-from lerobot_roborecover.policies.detectors.interface import Detector, MonitorDetector
+from lerobot_roborecover.policies.detectors.interface import Detector
 from lerobot_roborecover.policies.detectors.probe import PolicyProbe
-from lerobot_roborecover.policies.detectors.progress import ProgressDetector
 from lerobot_roborecover.policies.interventions.configuration_intervention import (
     MonitorConfig,
     RoboRecoverInterventionConfig,
@@ -130,7 +128,6 @@ class RoboRecoverInterventionPolicy(PreTrainedPolicy):
         return torch.from_numpy(np.stack([rows.pop(0) for rows in self._rows]))
 
     def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> Tensor:
-        """The next action as a chunk of one."""
         return self.select_action(batch)[:, None]
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict | None]:
@@ -170,22 +167,14 @@ def _monitor(config: MonitorConfig, device: str, features: dict, probe: PolicyPr
         overrides["base_model"] = config.base_model
     detector = load_detector(config.path, device, revision=config.revision, **overrides)
     option = f"--policy.monitor.path={config.path}"
-    if isinstance(detector, DetectorRewardModel | ProgressDetector):
-        settings: Any = detector.config if isinstance(detector, DetectorRewardModel) else detector.options
-        if not getattr(detector, "fitted", True):
-            raise OptionError(
-                f"{option}: has not been fitted; `roborecover detect evaluate --detector` fits and saves it"
-            )
-        if settings.threshold is None:
-            raise OptionError(
-                f"{option}: has no threshold, and would never trigger. Give --policy.monitor.threshold, or "
-                "the folder that `roborecover detect evaluate --detector` saved, which has one"
-            )
-    missing = sorted(set(detector.needs.features) - set(features)) if features else []
-    if missing and isinstance(detector, MonitorDetector):
+    if not detector.fitted:
         raise OptionError(
-            f"{option}: was trained on {sorted(detector.needs.features)}; the "
-            f"environment gives no {missing[0]}, only {sorted(features)}. See --env.obs_type"
+            f"{option}: has not been fitted; `roborecover detect evaluate --detector` fits and saves it"
+        )
+    if not detector.decides:
+        raise OptionError(
+            f"{option}: has no threshold, and would never trigger. Give --policy.monitor.threshold, or "
+            "the folder that `roborecover detect evaluate --detector` saved, which has one"
         )
     if features or detector.needs.truth or detector.needs.of_policy:
         there = features or dict.fromkeys(detector.needs.features)

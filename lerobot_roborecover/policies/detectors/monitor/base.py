@@ -1,27 +1,22 @@
-"""Base class of both monitors: LeRobot 0.6.1's contract of reward models, the composite policy's contract of
-monitors, and the record of what they were trained on."""
+"""Base class of both monitors: detectors that `lerobot-train` trains on labelled frames, and the record of
+what they were trained on."""
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
 from huggingface_hub import HfApi
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.rewards import RewardModelConfig
-from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import REWARD
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
-from lerobot_roborecover.policies.detectors.interface import Verdicts
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.base import DetectorRewardModel
+from lerobot_roborecover.policies.detectors.interface import DetectorError, DetectorNeeds
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
@@ -29,72 +24,45 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-TASK = "task"
-"""LeRobot's batch key of the language instructions."""
 _NO_LABELS = f"the dataset has no column {REWARD}; make one with `roborecover detect data`"
-TRAINED_ON_FILE = "monitor_training.json"
-"""Beside the weights: which scenarios the training set held, so that no evaluation uses them again."""
 
 
-@dataclass(frozen=True)
-class Answers:
-    """What a monitor answers for B frames."""
+class MonitorRewardModel(DetectorRewardModel):
+    """A detector whose reward is the label: 0 before the recovery point, 1 from it on.
 
-    scores: Tensor
-    """(B,) float32 in [0, 1]: probability of label 1."""
-    decisions: Tensor
-    """(B,) bool: label 1, that is "intervene". Never True where the answer could not be read."""
-    parsed: Tensor
-    """(B,) bool: the answer could be read."""
+    It looks at the last observation alone, and can be trained on labelled frames.
+    """
 
-
-class MonitorRewardModel(PreTrainedRewardModel):
-    """A reward model whose reward is the label: 0 before the recovery point, 1 from it on."""
-
-    # LeRobot declares both as None, for subclasses to replace.
-    config_class: type[RewardModelConfig] = RewardModelConfig  # ty: ignore[incompatible-attribute-override]
-    name: str = "roborecover_monitor_base"  # ty: ignore[incompatible-attribute-override]
+    config_class: type[RewardModelConfig] = RewardModelConfig
+    name: str = "roborecover_monitor_base"
+    probabilities = True
 
     def __init__(self, config: Any, dataset_stats: Any = None, dataset_meta: Any = None, **_: Any):
         super().__init__(config)
-        self.trained_on: dict[str, Any] = {}
-        """What `TRAINED_ON_FILE` holds; empty where it is not known."""
         if dataset_meta is not None:
             if REWARD not in dataset_meta.features:
-                raise MonitorError(_NO_LABELS)
+                raise DetectorError(_NO_LABELS)
             self.trained_on = _scenarios_of(dataset_meta)
             choose_features(config, dataset_meta.features)
         if not config.input_features:
-            raise MonitorError(
+            raise DetectorError(
                 f"{config.type}: it is not known what the monitor reads. Train it on a dataset, load a "
                 "checkpoint, or give input_features"
             )
 
-    # --- the contract of the composite policy
+    # --- the contract of detectors
 
     @property
-    def input_features(self) -> Mapping[str, PolicyFeature]:
-        """What it reads, by LeRobot key."""
-        return self.config.input_features
+    def needs(self) -> DetectorNeeds:
+        """The observations that it reads, by LeRobot key."""
+        return DetectorNeeds(features=self.config.input_features)
 
     @property
-    def max_batch(self) -> int:
-        """Frames it can judge at once."""
-        raise NotImplementedError
-
-    @torch.inference_mode()
-    def judge(self, observations: Mapping[str, Tensor], instructions: Sequence[str]) -> Verdicts:
-        """Judges a batch of observations; see `interface.Monitor`."""
-        answers = self.answer({**observations, TASK: list(instructions)})
-        scores = answers.scores.float().cpu().numpy().copy()
-        scores[~answers.parsed.cpu().numpy()] = np.nan
-        return Verdicts(scores=scores, triggers=answers.decisions.cpu().numpy())
+    def decides(self) -> bool:
+        """Its answer decides, with or without a threshold."""
+        return True
 
     # --- the contract of LeRobot
-
-    def answer(self, batch: Mapping[str, Any]) -> Answers:
-        """Scores and decisions of a batch, without gradients kept."""
-        raise NotImplementedError
 
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
         """(B,) float32: the decision, 0 or 1."""
@@ -104,14 +72,14 @@ class MonitorRewardModel(PreTrainedRewardModel):
         """(B,) float32 labels of a training batch.
 
         Raises:
-            MonitorError: the dataset has none, or other values than 0 and 1.
+            DetectorError: the dataset has none, or other values than 0 and 1.
         """
         # LeRobot's processors put the number 0.0 where a batch has no reward.
         if not isinstance(batch.get(REWARD), Tensor):
-            raise MonitorError(_NO_LABELS)
+            raise DetectorError(_NO_LABELS)
         labels = batch[REWARD].reshape(-1).float()
         if not ((labels == 0) | (labels == 1)).all():
-            raise MonitorError(
+            raise DetectorError(
                 f"column {REWARD} holds {labels[(labels != 0) & (labels != 1)][0].item():g}; a monitor's "
                 "labels are 0 and 1. Make the dataset with `roborecover detect data`"
             )
@@ -121,13 +89,13 @@ class MonitorRewardModel(PreTrainedRewardModel):
         """Refuses observations that lack what the monitor reads, or hold it in another form.
 
         Raises:
-            MonitorError: naming the key, and what there is.
+            DetectorError: naming the key, and what there is.
         """
         for key, feature in self.config.input_features.items():
             value = batch.get(key)
             if value is None:
                 there = sorted(k for k in batch if k.startswith("observation."))
-                raise MonitorError(
+                raise DetectorError(
                     f"the monitor reads {key}, which the environment does not give; it gives {there}. Use a "
                     "monitor trained on these, or the cameras and obs_type that this one was trained on "
                     f"({sorted(self.config.input_features)})"
@@ -135,7 +103,7 @@ class MonitorRewardModel(PreTrainedRewardModel):
             width = tuple(value.shape[1:]) if feature.type is not FeatureType.VISUAL else value.shape[1:2]
             wanted = tuple(feature.shape) if feature.type is not FeatureType.VISUAL else feature.shape[:1]
             if tuple(width) != tuple(wanted):
-                raise MonitorError(
+                raise DetectorError(
                     f"the monitor was trained on {key} of shape {tuple(feature.shape)}; here it is "
                     f"{tuple(value.shape[1:])}. Use a monitor of this platform"
                 )
@@ -147,15 +115,6 @@ class MonitorRewardModel(PreTrainedRewardModel):
         if earlier:
             scenarios = {**earlier["scenarios"], **self.trained_on.get("scenarios", {})}
             self.trained_on = {**earlier, **self.trained_on, "scenarios": scenarios}
-
-    def _save_pretrained(self, save_directory: Path) -> None:
-        self.config._save_pretrained(save_directory)
-        self.save_weights(save_directory)
-        if self.trained_on:
-            (save_directory / TRAINED_ON_FILE).write_text(json.dumps(self.trained_on, indent=1) + "\n")
-
-    def save_weights(self, folder: Path) -> None:
-        raise NotImplementedError
 
     def push_model_to_hub(self, cfg: TrainPipelineConfig, **_: Any) -> None:
         """Uploads weights, configs and a card.
@@ -205,7 +164,7 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
         features: of the dataset, by column.
 
     Raises:
-        MonitorError: the dataset lacks an input, or has it in another shape.
+        DetectorError: the dataset lacks an input, or has it in another shape.
     """
     there = dataset_to_policy_features({k: dict(f) for k, f in features.items()})
     known = {k: f for k, f in there.items() if config.can_read(k, f)}
@@ -213,7 +172,7 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
         wanted = [k.strip() for k in config.inputs.split(",") if k.strip()] or list(known)
         missing = [k for k in wanted if k not in known]
         if missing or not wanted:
-            raise MonitorError(
+            raise DetectorError(
                 f"--reward_model.inputs={config.inputs}: the dataset has no "
                 f"{missing[0] if missing else 'input'} that {config.type} can read; it has {sorted(known)}"
             )
@@ -222,7 +181,7 @@ def choose_features(config: Any, features: Mapping[str, Mapping[str, Any]]) -> N
         own = known.get(key)
         axes = slice(0, 1) if feature.type is FeatureType.VISUAL else slice(None)
         if own is None or tuple(own.shape)[axes] != tuple(feature.shape)[axes]:
-            raise MonitorError(
+            raise DetectorError(
                 f"the monitor reads {key} of shape {tuple(feature.shape)}; the dataset has "
                 f"{ {k: tuple(f.shape) for k, f in known.items()} }"
             )

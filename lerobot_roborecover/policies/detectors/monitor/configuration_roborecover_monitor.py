@@ -9,7 +9,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.optim.schedulers import ConstantWithWarmupSchedulerConfig
 
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 
 PROMPT = (
     "The robot is carrying out this task: {instruction}\n"
@@ -70,14 +70,14 @@ class RoboRecoverMonitorConfig(RewardModelConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if "{instruction}" not in self.prompt:
-            raise MonitorError(f"prompt={self.prompt!r:.80}: it must hold {{instruction}}")
+            raise DetectorError(f"prompt={self.prompt!r:.80}: it must hold {{instruction}}")
         if self.dtype not in ("bfloat16", "float32"):
-            raise MonitorError(f"dtype={self.dtype}: must be bfloat16 or float32")
+            raise DetectorError(f"dtype={self.dtype}: must be bfloat16 or float32")
         for name in ("lora_rank", "micro_batch_size", "max_batch"):
             if getattr(self, name) < 1:
-                raise MonitorError(f"{name}={getattr(self, name)}: must be at least 1")
+                raise DetectorError(f"{name}={getattr(self, name)}: must be at least 1")
         if self.threshold is not None and not 0.0 < self.threshold < 1.0:
-            raise MonitorError(f"threshold={self.threshold}: must be above 0 and below 1, or null")
+            raise DetectorError(f"threshold={self.threshold}: must be above 0 and below 1, or null")
 
     def can_read(self, key: str, feature: PolicyFeature) -> bool:
         """Whether a dataset's feature can be an input: cameras only."""

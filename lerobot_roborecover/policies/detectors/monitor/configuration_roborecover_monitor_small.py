@@ -9,7 +9,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 
 
 @RewardModelConfig.register_subclass("roborecover_monitor_small")
@@ -50,10 +50,10 @@ class RoboRecoverMonitorSmallConfig(RewardModelConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 < self.threshold < 1.0:
-            raise MonitorError(f"threshold={self.threshold}: must be above 0 and below 1")
+            raise DetectorError(f"threshold={self.threshold}: must be above 0 and below 1")
         for name in ("hidden_dim", "n_layers", "image_size", "max_batch"):
             if getattr(self, name) < 1:
-                raise MonitorError(f"{name}={getattr(self, name)}: must be at least 1")
+                raise DetectorError(f"{name}={getattr(self, name)}: must be at least 1")
 
     def can_read(self, key: str, feature: PolicyFeature) -> bool:
         """Whether a dataset's feature can be an input."""

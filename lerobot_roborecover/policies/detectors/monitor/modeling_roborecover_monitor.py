@@ -14,12 +14,13 @@ from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from lerobot_roborecover.policies.detectors.monitor.base import TASK, Answers, MonitorRewardModel
+from lerobot_roborecover.policies.detectors.base import Answers
+from lerobot_roborecover.policies.detectors.files import find_file, read_trained_on
+from lerobot_roborecover.policies.detectors.interface import TASK, DetectorError
+from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor import (
     RoboRecoverMonitorConfig,
 )
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor.files import find_file, read_trained_on
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         self.answer_ids = [answer_id(self.processor.tokenizer, a) for a in ANSWERS]
         found = base_fingerprint(base)
         if config.base_fingerprint and config.base_fingerprint != found:
-            raise MonitorError(
+            raise DetectorError(
                 f"the adapters were trained on another base than {config.base_model!r} (fingerprint "
                 f"{config.base_fingerprint[:12]}, here {found[:12]}). Put the right "
                 "base_model and base_revision into the checkpoint's config.json, or give --base-model"
@@ -89,12 +90,7 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         try:
             self.model = get_peft_model(base, lora, autocast_adapter_dtype=True)
         except ValueError as err:
-            raise MonitorError(f"lora_targets={config.lora_targets}: {err}") from None
-
-    @property
-    def max_batch(self) -> int:
-        """Frames it can judge at once."""
-        return self.config.max_batch
+            raise DetectorError(f"lora_targets={config.lora_targets}: {err}") from None
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """The adapters alone."""
@@ -186,7 +182,7 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         count = len(pictures[0])
         tasks = batch.get(TASK)
         if tasks is None:
-            raise MonitorError("the monitor needs the instruction of every frame; the batch has no 'task'")
+            raise DetectorError("the monitor needs the instruction of every frame; the batch has no 'task'")
         texts = [self._prompt(text, len(keys)) for text in list(tasks)[rows]]
         images = [[column[i] for column in pictures] for i in range(count)]
         encoded = self.processor(
@@ -229,24 +225,24 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         """Loads the base, then the adapters from a folder or the Hub, in evaluation mode.
 
         Raises:
-            MonitorError: the adapters are missing, do not fit, or are of another base.
+            DetectorError: the adapters are missing, do not fit, or are of another base.
         """
         from peft import set_peft_model_state_dict
 
         if config is None:
             config = RoboRecoverMonitorConfig.from_pretrained(pretrained_name_or_path, revision=revision)
         if not isinstance(config, RoboRecoverMonitorConfig):
-            raise MonitorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
+            raise DetectorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
         file = find_file(pretrained_name_or_path, ADAPTER_FILE, revision)
         model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
         try:
             result = set_peft_model_state_dict(model.model, load_file(file))
         except RuntimeError as err:
-            raise MonitorError(f"{file} does not fit its config.json: {err}") from None
+            raise DetectorError(f"{file} does not fit its config.json: {err}") from None
         missing = [k for k in result.missing_keys if "lora_" in k]
         if missing or result.unexpected_keys:
             odd = missing[0] if missing else result.unexpected_keys[0]
-            raise MonitorError(
+            raise DetectorError(
                 f"{file} does not fit its config.json: {len(missing)} adapters are missing and "
                 f"{len(result.unexpected_keys)} not known, e.g. {odd}"
             )
@@ -258,7 +254,7 @@ def load_base(config: RoboRecoverMonitorConfig) -> tuple[Any, Any]:
     """The base model and its processor.
 
     Raises:
-        MonitorError: it cannot be found, or is not a Qwen3-VL model.
+        DetectorError: it cannot be found, or is not a Qwen3-VL model.
     """
     from transformers import AutoConfig, AutoProcessor, Qwen3VLForConditionalGeneration
 
@@ -266,7 +262,7 @@ def load_base(config: RoboRecoverMonitorConfig) -> tuple[Any, Any]:
     try:
         kind = AutoConfig.from_pretrained(config.base_model, revision=revision).model_type
         if kind != "qwen3_vl":
-            raise MonitorError(
+            raise DetectorError(
                 f"base_model={config.base_model}: is a {kind!r} model; this monitor is built on Qwen3-VL"
             )
         base = Qwen3VLForConditionalGeneration.from_pretrained(
@@ -277,9 +273,9 @@ def load_base(config: RoboRecoverMonitorConfig) -> tuple[Any, Any]:
         )
         processor = AutoProcessor.from_pretrained(config.base_model, revision=revision)
     except (OSError, ValueError) as err:
-        if isinstance(err, MonitorError):
+        if isinstance(err, DetectorError):
             raise
-        raise MonitorError(
+        raise DetectorError(
             f"base_model={config.base_model}: cannot be loaded ({str(err)[:300]}). Give a Hub id or the "
             "folder of a Qwen3-VL model with its processor, e.g. Qwen/Qwen3-VL-2B-Instruct"
         ) from err
@@ -290,11 +286,11 @@ def answer_id(tokenizer: Any, answer: str) -> int:
     """The one token of an answer.
 
     Raises:
-        MonitorError: the tokenizer splits it.
+        DetectorError: the tokenizer splits it.
     """
     ids = tokenizer.encode(answer, add_special_tokens=False)
     if len(ids) != 1:
-        raise MonitorError(
+        raise DetectorError(
             f"the base's tokenizer makes {len(ids)} tokens of {answer!r}; the answer must be one"
         )
     return ids[0]

@@ -13,12 +13,13 @@ from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from lerobot_roborecover.policies.detectors.monitor.base import TASK, Answers, MonitorRewardModel
+from lerobot_roborecover.policies.detectors.base import Answers
+from lerobot_roborecover.policies.detectors.files import WEIGHTS_FILE, find_file, read_trained_on
+from lerobot_roborecover.policies.detectors.interface import TASK, DetectorError
+from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor_small import (
     RoboRecoverMonitorSmallConfig,
 )
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
-from lerobot_roborecover.policies.detectors.monitor.files import WEIGHTS_FILE, find_file, read_trained_on
 
 _FURTHEST = 10.0
 """Normalised values are cut off here: a state far outside the training data should not drown the others."""
@@ -68,11 +69,6 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
             layers.append(nn.Dropout(config.dropout))
             joined = config.hidden_dim
         self.head = nn.Sequential(*layers, nn.Linear(joined, 1))
-
-    @property
-    def max_batch(self) -> int:
-        """Frames it can judge at once."""
-        return self.config.max_batch
 
     def _normalise_as(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
         def joined(name: str) -> Tensor:
@@ -142,18 +138,18 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
         """Loads a checkpoint from a folder or the Hub, in evaluation mode.
 
         Raises:
-            MonitorError: the weights are missing, or are of another network.
+            DetectorError: the weights are missing, or are of another network.
         """
         if config is None:
             config = RoboRecoverMonitorSmallConfig.from_pretrained(pretrained_name_or_path, revision=revision)
         if not isinstance(config, RoboRecoverMonitorSmallConfig):
-            raise MonitorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
+            raise DetectorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
         file = find_file(pretrained_name_or_path, WEIGHTS_FILE, revision)
         model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
         try:
             model.load_state_dict(load_file(file))
         except RuntimeError as err:
-            raise MonitorError(f"{file} does not fit its config.json: {err}") from None
+            raise DetectorError(f"{file} does not fit its config.json: {err}") from None
         model.add_trained_on(read_trained_on(pretrained_name_or_path, revision))
         return model.to(config.device).eval()
 

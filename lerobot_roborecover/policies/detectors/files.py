@@ -1,4 +1,4 @@
-"""Files of a monitor's checkpoint, in a folder or on the Hub."""
+"""Files of a detector's checkpoint, in a folder or on the Hub."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from typing import Any
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.checkpoint import check_file
-from lerobot_roborecover.policies.detectors.monitor.errors import MonitorError
+from lerobot_roborecover.policies.detectors.interface import DetectorError
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
+TRAINED_ON_FILE = "monitor_training.json"
+"""Beside the weights: which scenarios the training set held, so that no evaluation uses them again."""
 
 
 def find_file(path: str | Path, name: str, revision: str | None = None) -> Path:
     """A checkpoint's file; downloaded where the checkpoint is on the Hub.
 
     Raises:
-        MonitorError: there is no such checkpoint or file.
+        DetectorError: there is no such checkpoint or file.
     """
     folder = Path(path).expanduser()
     if folder.is_dir():
         if not (folder / name).is_file():
             there = sorted(p.name for p in folder.iterdir())[:20]
-            raise MonitorError(
+            raise DetectorError(
                 f"{folder} has no {name}: it is not a complete checkpoint; it holds {there}. A "
                 "training run's checkpoint is its checkpoints/last/pretrained_model folder"
             )
@@ -35,7 +37,7 @@ def find_file(path: str | Path, name: str, revision: str | None = None) -> Path:
     try:
         return _whole(Path(hf_hub_download(str(path), name, revision=revision)), str(path))
     except (HFValidationError, HfHubHTTPError, LocalEntryNotFoundError) as err:
-        raise MonitorError(
+        raise DetectorError(
             f"checkpoint {str(path)!r} is neither a folder nor a Hub model with {name} "
             f"({type(err).__name__}). Check the spelling, the revision, and `hf auth login` for a private one"
         ) from err
@@ -46,17 +48,15 @@ def _whole(file: Path, label: str) -> Path:
     try:
         check_file(file, label)
     except OptionError as err:
-        raise MonitorError(str(err)) from None
+        raise DetectorError(str(err)) from None
     return file
 
 
 def read_trained_on(path: str | Path, revision: str | None = None) -> dict[str, Any]:
     """Which scenarios a checkpoint was trained on; empty where it does not say."""
-    from lerobot_roborecover.policies.detectors.monitor.base import TRAINED_ON_FILE
-
     try:
         found = json.loads(find_file(path, TRAINED_ON_FILE, revision).read_text())
-    except (MonitorError, ValueError):
+    except (DetectorError, ValueError):
         return {}
     good = isinstance(found, dict) and isinstance(found.get("scenarios"), dict)
     return found if good else {}
