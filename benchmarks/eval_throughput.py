@@ -89,8 +89,8 @@ def of_engine(slots: int, times: Times, trials: int) -> Throughput:
         for k in range(slots)
     ]  # fmt: skip
     run = EvalSession(None, EvalProtocol("recovery", 0, "p", 0, times.executed), None, "d", None)
-    seats = [VirtualSlot(world) for _ in range(slots)]
-    engine = Engine(run, seats, [InlineReplica(host)], world.wait, clock=world.clock)
+    workers = [VirtualSlot(world) for _ in range(slots)]
+    engine = Engine(run, workers, [InlineReplica(host)], world.wait, clock=world.clock)
     assert engine.run(units_of(scenarios, trials)) == slots * trials
     steps = trials * sum(s.task.horizon for s in scenarios)
     return Throughput(

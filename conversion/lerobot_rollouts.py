@@ -22,7 +22,6 @@ from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id, open_lerobot_folder
 from lerobot_roborecover.datasets.licenses import license_argument
-from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
 from lerobot_roborecover.datasets.video_frames import check_frames
@@ -152,8 +151,8 @@ def why_not(path: Path, features: dict[str, Any], recorded_by_eval: bool) -> str
 def find_task(args: argparse.Namespace, instruction: str) -> Task:
     """The task of an episode."""
     if args.task:
-        return task_by_name(args.platform, args.task, instruction, args.suite)
-    return task_by_instruction(args.platform, instruction, args.suite)
+        return platform_named(args.platform).task(args.task, instruction, args.suite)
+    return platform_named(args.platform).task_by_instruction(instruction, args.suite)
 
 
 if __name__ == "__main__":

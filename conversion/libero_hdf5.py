@@ -20,8 +20,8 @@ from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
 from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array, read_group
 from lerobot_roborecover.datasets.licenses import license_argument
-from lerobot_roborecover.datasets.task_lookup import task_by_name
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.scenario import ScenarioError, Task
 
@@ -66,7 +66,7 @@ def episodes(path: Path, suite: str, driver: str, failed: list[str]) -> Iterator
     with open_hdf5(path) as file:
         data = read_group(file, "data", "it is not a LIBERO or robomimic file")
         bddl = PurePosixPath(str(data.attrs.get("bddl_file_name", ""))).stem
-        task = task_by_name("libero", bddl or path.stem.removesuffix("_demo"), suite=suite)
+        task = platform_named("libero").task(bddl or path.stem.removesuffix("_demo"), suite=suite)
         states = read_init_states(task.suite, task.name)
         for name in episode_names(data, "demo_"):
             try:

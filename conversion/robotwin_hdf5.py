@@ -24,8 +24,8 @@ from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array, read_group
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.release.tables import read_file
-from lerobot_roborecover.datasets.task_lookup import task_by_name
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 
 CAMERAS = ("head_camera", "left_camera", "right_camera")
@@ -75,7 +75,7 @@ def episodes(folder: Path, kind: str, failed: list[str]) -> Iterator[Trajectory]
             number = int(path.stem.removeprefix("episode"))
             said = instruction(folder, number, kind)
             where = folder.resolve()
-            task = task_by_name("robotwin", where.parent.name, said, where.name)
+            task = platform_named("robotwin").task(where.parent.name, said, where.name)
             with open_hdf5(path) as file:
                 joints = read_array(file, "joint_action/vector", ndim=2, width=14).astype(np.float64)
                 if len(joints) < 2:

@@ -19,8 +19,6 @@ MEASURED = float("nan")
 
 @dataclass(frozen=True)
 class LatencyRate:
-    """One policy at one latency."""
-
     policy: str
     during_inference: str
     """`hold` or `chunk`; empty with a frozen clock."""

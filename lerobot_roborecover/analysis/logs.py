@@ -165,7 +165,7 @@ def _check_one_setting(log: ReadLog, name: str) -> None:
             differences = settings_differences(known[0].policy_settings or {}, row.policy_settings or {})
             raise RowsError(
                 f"{log.path} holds trials of {log.policies[0]} under several settings ({differences}): no "
-                f"one NAME fits. Name the log alone, without {name}=, and they are told apart"
+                f"one NAME fits. Name the log alone, without {name}=, and they are distinguished"
             )
 
 

@@ -19,7 +19,7 @@ _LETTERS = str.maketrans(
 
 
 def look(text: str) -> str:
-    """Returns what a name looks like; names of one look cannot be told apart."""
+    """Returns what a name looks like; names of one look cannot be distinguished."""
     visible = (c for c in normalize("NFKC", text) if category(c) != "Cf")
     return " ".join("".join(visible).translate(_LETTERS).split())
 

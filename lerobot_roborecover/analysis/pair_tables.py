@@ -33,8 +33,8 @@ def paired_contrasts(results: Results) -> Table:
         "Percentage points, over the scenarios that both were run on. Intervals are not adjusted; p (Holm) "
         f"is, for the {family} pairs of complete policies. p: paired sign-flip permutation test over "
         f"{results.unit}. It tests whether their differences are as likely to have either sign, not whether "
-        "their mean is zero: a policy that is much better on few and a little worse on many can be told "
-        "apart from one with the same RSR.",
+        "their mean is zero: a policy that is much better on few and a little worse on many can differ "
+        "from one with the same RSR.",
         f"Verdict: p (Holm) below {1 - level:.3g}, and at least {LEAST_DIFFERING} {results.unit} on which "
         "the two differ; incomplete policies have none.",
         *_watched_note(results),

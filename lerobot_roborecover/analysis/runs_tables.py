@@ -44,7 +44,6 @@ def methods(results: Results) -> Table:
 
 
 def each_run(results: Results) -> Table:
-    """One row a run."""
     rows: list[tuple[Cell, ...]] = []
     for found, m in zip(results.runs, results.method_rates, strict=True):
         for run, rate, trials in zip(found.runs, m.each, found.trials, strict=True):

@@ -161,7 +161,6 @@ def _trials(arm: Arm, scheduled: int | None) -> int:
 
 
 def recorded_plan(record: SequentialRecord, panel: Panel) -> SequentialPlan:
-    """The plan that a record keeps."""
     labels = record.units or [
         dict(zip([s.id for s in panel.scenarios], panel.units().tolist(), strict=True)).get(
             scenario, f"scenario:{scenario}"

@@ -54,8 +54,6 @@ class CellSummary:
 
 @dataclass(frozen=True)
 class StartSummary:
-    """All trials from one start."""
-
     start: Start
     scenarios: int
     trials: int
@@ -106,7 +104,7 @@ def summarise(rows: Sequence[Mapping[str, Any]], scheduled: int | None = None) -
         scheduled: trials each scenario was to have from each start; missing ones count as failures.
 
     Raises:
-        RowsError: the rows are of several policies, or cannot be told apart.
+        RowsError: the rows are of several policies, or cannot be distinguished.
     """
     policies = sorted({str(row["policy"]) for row in rows})
     if len(policies) > 1:

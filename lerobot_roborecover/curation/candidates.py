@@ -7,7 +7,7 @@ float64 actions, task, reset, controller. Beside that, in `meta/roborecover/`:
   versions of the simulator that recorded them;
 - `steps.parquet`: one row an episode: body poses and the task's predicate before the first action and after
   each, and where an action was perturbed;
-- `decisions.jsonl`: what each stage decided (`curation/attrition.py`);
+- `decisions.jsonl`: what each stage decided (`curation/funnel.py`);
 - `votes/NAME.jsonl`: what each annotator marked (`curation/annotation/votes.py`).
 
 What comes from a file is checked here and trusted afterwards.

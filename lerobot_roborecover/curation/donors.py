@@ -91,7 +91,6 @@ class Donor:
 
     @property
     def successes(self) -> list[PolicyTrial]:
-        """Those that succeeded."""
         return [t for t in self.trials if t.row.success]
 
 
@@ -128,7 +127,7 @@ def choose_candidates(
             scenarios, are read. An invalid trial counts as a failure.
         base: the base policy, as its rows name it.
         options: thresholds.
-        funnel: told.
+        funnel: counts what stays.
 
     Raises:
         ScenarioError: no row is of the base.
@@ -180,7 +179,7 @@ def judge(
         candidates: from `choose_candidates`.
         trials: of the candidates' policies, with actions; others are ignored.
         options: thresholds.
-        funnel: told.
+        funnel: counts what stays.
 
     Raises:
         ScenarioError: two trials of a policy that is said to be deterministic differ.
@@ -275,10 +274,10 @@ def write_donors(
         chosen: from `deduplicate`.
         simulator: its options, which decide the observations.
         workers: processes that replay.
-        funnel: told, and described in the dataset's manifest.
+        funnel: counts what stays, and is described in the dataset's manifest.
         description: free text.
         license: SPDX identifier, or None where none is decided.
-        on_trajectory: told how many are done of how many.
+        on_trajectory: called with how many are done of how many.
         also: writes further files into the folder before it appears; `funnel` is complete then.
 
     Raises:

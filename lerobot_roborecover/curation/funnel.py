@@ -51,8 +51,6 @@ class Decision:
 
 @dataclass(frozen=True)
 class StageCounts:
-    """One stage of the funnel."""
-
     stage: str
     entered: int
     kept: int

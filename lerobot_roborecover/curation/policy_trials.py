@@ -82,7 +82,7 @@ def run_trials(
         replicas: copies of the policy on a cluster, see `EngineConfig`.
         policy_options: `--name=value` options of the policy's config.
         rename_map: the env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`.
-        on_row: told of each finished trial, and how many are done of how many.
+        on_row: called with each finished trial, and how many are done of how many.
 
     Returns:
         Trials by scenario id, then trial index; of exactly this policy, seed and options.

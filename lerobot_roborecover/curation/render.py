@@ -55,7 +55,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
 
     Args:
         request: what and how.
-        progress: told how many parts are done of how many.
+        progress: called with how many parts are done of how many.
 
     Returns:
         The number of episodes.

@@ -132,7 +132,7 @@ def _origin(number: int, sha256: str, sets: Sequence[CandidateSet]) -> tuple[Can
         names = ", ".join(c.id for c, _ in found)[:200]
         raise ScenarioError(
             f"episode {number}: {len(found)} candidates of the sources have these actions"
-            + (f" ({names}); they cannot be told apart. Remove all but one" if found else "")
+            + (f" ({names}); not distinguishable. Remove all but one" if found else "")
             + ("" if found else ". Name every dataset that it came from")
         )
     return next(iter(found.values()))

@@ -38,8 +38,6 @@ GRID_TILES = 12
 
 @dataclass(frozen=True)
 class CardFiles:
-    """A card and what it shows."""
-
     license: str
     """As in the Hub's metadata."""
     files: Mapping[str, bytes]

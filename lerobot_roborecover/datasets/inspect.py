@@ -22,8 +22,6 @@ from lerobot_roborecover.utils.text import align, pluralize
 
 @dataclass(frozen=True)
 class ReplayState:
-    """One state of a replay."""
-
     step: int
     """Prefix actions replayed so far."""
     picture: np.ndarray

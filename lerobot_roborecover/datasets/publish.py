@@ -95,7 +95,6 @@ class PublishPlan:
     """Why the Hub was not compared with; such a plan can be shown, not carried out."""
 
     def lines(self) -> list[str]:
-        """The plan for people."""
         seen = "private" if self.config.private else "public"
         where = "an existing repository" if self.exists else f"a new {seen} repository"
         tags = ", ".join(f"{t} (moved)" if moved else t for t, moved in self.tags.items())
@@ -125,8 +124,6 @@ class PublishPlan:
 
 @dataclass(frozen=True)
 class Published:
-    """What was published."""
-
     commit: str
     tags: tuple[str, ...]
     url: str

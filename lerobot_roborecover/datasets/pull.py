@@ -36,8 +36,6 @@ _LIMITS = {_EVALUATION[0]: MAX_MANIFEST_BYTES, _EVALUATION[1]: MAX_PARQUET_BYTES
 
 @dataclass(frozen=True)
 class Pulled:
-    """What was pulled."""
-
     root: Path
     commit: str
     """The revision to pin."""

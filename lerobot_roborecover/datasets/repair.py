@@ -219,7 +219,7 @@ def _only[T](number: int, matches: dict[str, T], steps: int) -> T:
             + (
                 ". Name every dataset that it came from"
                 if not matches
-                else f" ({', '.join(list(matches)[:4])[:200]}); they cannot be told apart. Remove all but one"
+                else f" ({', '.join(list(matches)[:4])[:200]}); not distinguishable. Remove all but one"
             )
         )
     return next(iter(matches.values()))

@@ -16,8 +16,6 @@ from lerobot_roborecover.workers.slots import SimulatorWorker
 
 @dataclass(eq=False)
 class WorkerState:
-    """A worker and its trial."""
-
     slot: SimulatorWorker
     last: WorkItem[TrialStart] | None = None
     """The last or current work item."""

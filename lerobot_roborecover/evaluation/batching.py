@@ -15,10 +15,10 @@ from collections import deque
 from collections.abc import Sequence
 from statistics import linear_regression, quantiles
 
-PATIENCE = 0.5
-"""How long who waits alone waits for half of all, in inferences. Where an inference takes as long for many as
-for few, a batch that begins before its company has come costs the company a whole inference."""
-_MOST_PATIENT_S = 0.25
+WAIT_SHARE = 0.5
+"""How long a single waiting trial waits for half of the trials, in inferences. Where an inference takes as
+long for many as for few, trials that miss a batch wait a whole inference longer."""
+_MAX_WAIT_S = 0.25
 _SPREAD = 1.5
 """Batch sizes of an inference that lie so far apart tell what an observation more costs."""
 _RECENT = 8
@@ -62,14 +62,14 @@ class BatchTimer:
         Returns:
             The latest time to wait until; a time in the past when the batch should be sent now.
         """
-        first, everybody = min(waiting), len(waiting) + len(acting)
+        first, total = min(waiting), len(waiting) + len(acting)
         if len(waiting) >= limit or not (acting or handing_off):
             return first
-        if acting and limit >= everybody:
-            round_s = self._simulation_s(everybody)
+        if acting and limit >= total:
+            round_s = self._simulation_s(total)
             if round_s is not None and round_s <= self._fixed_s():
                 return max(acting) + round_s + self._least_s  # what a reply takes on its way, too
-        if len(waiting) >= min(limit, max((everybody + handing_off) // 2, 1)):
+        if len(waiting) >= min(limit, max((total + handing_off) // 2, 1)):
             return first
         return first + self.delay_s
 
@@ -78,14 +78,14 @@ class BatchTimer:
         """How long a trial waits for half of the trials."""
         # The shortest of the last inferences: the first ones compile.
         usual_s = min(self._inferences, default=0.0)
-        return max(self._least_s, min(PATIENCE * usual_s, _MOST_PATIENT_S))
+        return max(self._least_s, min(WAIT_SHARE * usual_s, _MAX_WAIT_S))
 
-    def _simulation_s(self, everybody: int) -> float | None:
-        """Returns the 90th percentile of the simulation time, if `everybody` trials step at once.
+    def _simulation_s(self, total: int) -> float | None:
+        """Returns the 90th percentile of the simulation time, if `total` trials step at once.
 
         Times of fewer trials are scaled up, because more trials have to share the cores.
         """
-        times = [seconds * max(1.0, everybody / together) for together, seconds in self._simulations]
+        times = [seconds * max(1.0, total / together) for together, seconds in self._simulations]
         return quantiles(times, n=10)[-1] if len(times) > 1 else None
 
     def _fixed_s(self) -> float:

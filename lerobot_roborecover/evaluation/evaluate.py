@@ -133,14 +133,14 @@ def evaluate(
             options, options.run_spec(), workers=True, facts=facts, scenarios=chosen, run_seed=seed
         )
         with run:
-            tally = RunProgress(run.protocol.start, chosen.ids, trials)
-            tally.add([asdict(r) for r in run.rows()])
+            counts = RunProgress(run.protocol.start, chosen.ids, trials)
+            counts.add([asdict(r) for r in run.rows()])
             line = ProgressLine(run.protocol.start, detailed=True) if progress else None
 
             def show(row: TrialRow) -> None:
-                tally.add([asdict(row)])
+                counts.add([asdict(row)])
                 if line is not None:
-                    line.show(tally)
+                    line.show(counts)
 
             units = units_of(sorted(chosen, key=lambda s: s.id), trials)
             places = EngineConfig(slots=slots, device=device, draws=options.obs_type != "state")
@@ -149,7 +149,7 @@ def evaluate(
                 count = pluralize(len(result.unrun), "trial")
                 logger.warning("%s could not be run, and have no row: %s", count, result.problem)
             if line is not None:
-                line.show(tally, final=True)
+                line.show(counts, final=True)
             found = {(r.scenario_id, r.trial): r for r in run.rows()}
     return [found[s.id, k] for s in chosen for k in range(trials) if (s.id, k) in found]
 

@@ -19,12 +19,11 @@ from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import plain_parsing
-from lerobot_roborecover.policies.determinism import make_cross_cpu_deterministic
+from lerobot_roborecover.policies.determinism import fit_threads, make_cross_cpu_deterministic
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.not_trained import NotTrained
 from lerobot_roborecover.policies.runner import PolicyRunner, ProvidesRunner
-from lerobot_roborecover.policies.threads import fit_threads
 from lerobot_roborecover.utils.plugins import register_plugins
 
 

@@ -167,14 +167,14 @@ class ProgressLine:
         self._shown_at = float("-inf")
         self._last = ""
 
-    def show(self, tally: ProgressState, *, final: bool = False) -> None:
+    def show(self, state: ProgressState, *, final: bool = False) -> None:
         """Writes the line if it says something new."""
         now = self._clock()
         if self._done_before is None:
-            self._done_before = tally.done
-        if self._paced_from is None and tally.done > self._done_before:
-            self._paced_from = now, tally.done
-        text = self._text(tally, now)
+            self._done_before = state.done
+        if self._paced_from is None and state.done > self._done_before:
+            self._paced_from = now, state.done
+        text = self._text(state, now)
         if self._stream.isatty():
             end = "\n" if final else ""
             self._stream.write(f"\r\033[K{text}{end}")
@@ -185,21 +185,21 @@ class ProgressLine:
         self._stream.flush()
         self._last, self._shown_at = text, now
 
-    def _text(self, tally: ProgressState, now: float) -> str:
+    def _text(self, state: ProgressState, now: float) -> str:
         """The line: trials, running rate, time left."""
-        parts = [f"{self._label:<9} {tally.done:>3}/{tally.total} {self._unit}"]
-        if tally.rate is not None:
-            bounds = tally.interval if self._detailed else None
+        parts = [f"{self._label:<9} {state.done:>3}/{state.total} {self._unit}"]
+        if state.rate is not None:
+            bounds = state.interval if self._detailed else None
             interval = f" [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]" if bounds else ""
-            parts.append(f"success {100 * tally.rate:.1f}{interval} % {tally.note}".rstrip())
-        if tally.done >= tally.total:
+            parts.append(f"success {100 * state.rate:.1f}{interval} % {state.note}".rstrip())
+        if state.done >= state.total:
             parts.append("done")
         elif self._paced_from is None:
             parts.append("starting LeRobot and the simulators ...")
-        elif tally.done > self._paced_from[1]:
+        elif state.done > self._paced_from[1]:
             since, done_then = self._paced_from
-            trial_s = (now - since) / (tally.done - done_then)
-            left_s = trial_s * (tally.total - tally.done)
+            trial_s = (now - since) / (state.done - done_then)
+            left_s = trial_s * (state.total - state.done)
             if self._detailed and trial_s:
                 parts.append(f"{60 / trial_s:.1f} {self._unit}/min")
             parts.append(f"about {_duration(left_s)} left")

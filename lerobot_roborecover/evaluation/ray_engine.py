@@ -165,7 +165,7 @@ def open_ray_engine(
     count = cluster.room(slots, replicas)
     cluster.make_slots(startup)
     run.pool.configure(snapshot_dir=snapshot_dir)
-    seats = run.pool.worker_slots(count if most is None else min(count, most))
+    workers = run.pool.worker_slots(count if most is None else min(count, most))
     # What decides how policies round here decides it there: torch reads these variables when it is loaded.
     chosen = {name: os.environ[name] for name in KERNELS if name in os.environ}
     policy = ray.remote(num_cpus=1, num_gpus=gpus, runtime_env={"env_vars": chosen})(PolicyActor)
@@ -177,4 +177,4 @@ def open_ray_engine(
     parts = [RayReplica(put, run.protocol.run_seed, run.policy_watchdog_s) for _ in range(replicas)]
     for part in parts:
         run.pool.on_close(part.close)
-    return Engine(run, seats, parts, wait_for_calls, **options)
+    return Engine(run, workers, parts, wait_for_calls, **options)

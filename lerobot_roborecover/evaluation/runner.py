@@ -54,7 +54,7 @@ class RunnerOptions:
     max_batch: int = 64
     """Slots the policy is asked for at once, at most."""
     batch_delay_ms: float = 10.0
-    """How long a slot waits for company before the policy is asked for it."""
+    """How long a waiting trial waits for others to join its batch."""
     limit_seconds: float = 0.0
     """Stop cleanly after this long; 0 does not. The same command goes on where it stopped."""
     videos: int | None = None
@@ -88,7 +88,6 @@ class RunnerOptions:
 
     @property
     def retried(self) -> list[str]:
-        """Outcomes of `retry`."""
         return [outcome.strip() for outcome in self.retry.split(",") if outcome.strip()]
 
     @property
@@ -217,33 +216,33 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             print(
                 f"{pluralize(again, 'trial')} run again; the old rows are kept in {beside}", file=sys.stderr
             )
-        stopper = StopCondition(cfg.runner.limit_seconds)
+        stop = StopCondition(cfg.runner.limit_seconds)
         try:
-            return _run(cfg, run, scenarios, stopper)
+            return _run(cfg, run, scenarios, stop)
         finally:
-            stopper.restore()
+            stop.restore()
 
 
-def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stopper: StopCondition) -> int:
+def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop: StopCondition) -> int:
     """Runs what is missing in the log, reports, and says how to go on where trials are left."""
     log, ids, out = run.require_log(), [s.id for s in scenarios], cfg.folder
     watch = open_watch(
         cfg.runner.sequential, scenarios, run.protocol, cfg.eval.n_episodes,
         log=log.path, shard=cfg.recovery_env.shard,
     )  # fmt: skip
-    tally = watch or RunProgress(run.protocol.start, ids, cfg.eval.n_episodes)
-    tally.add([asdict(r) for r in run.rows()])
+    progress = watch or RunProgress(run.protocol.start, ids, cfg.eval.n_episodes)
+    progress.add([asdict(r) for r in run.rows()])
     line = ProgressLine(run.protocol.start, detailed=True)
-    line.show(tally)
+    line.show(progress)
 
     def settled() -> bool:
-        if watch is not None and watch.decided and not stopper.reason:
-            stopper.reason = watch.words
+        if watch is not None and watch.decided and not stop.reason:
+            stop.reason = watch.words
         return watch is not None and watch.decided
 
     def show(row: TrialRow) -> None:
-        tally.add([asdict(row)])
-        line.show(tally)
+        progress.add([asdict(row)])
+        line.show(progress)
         settled()
 
     videos, result = None, RunResult()
@@ -256,10 +255,10 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
         order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
         result = run_work_items(
             run, units_of(order, cfg.eval.n_episodes), partial(load_host, host_spec(cfg)), _places(cfg),
-            stop=stopper, on_row=show, videos=videos, batch_delay_s=cfg.runner.batch_delay_ms / 1e3,
+            stop=stop, on_row=show, videos=videos, batch_delay_s=cfg.runner.batch_delay_ms / 1e3,
             queue_of=WorkQueue if watch is None else OrderedQueue,
         )  # fmt: skip
-    line.show(tally, final=True)
+    line.show(progress, final=True)
     if watch is not None:
         record = watch.record(log.path)
     report(cfg, run, scenarios, [] if videos is None else videos.kept)
@@ -268,11 +267,12 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
         if watch.decided:
             return 0
     go_on = f"run the same command with --env.trial_log={log.path} --output_dir={out}"
-    if stopper.reason:
+    if stop.reason:
         print(
-            f"{stopper.reason}: {tally.done} of {tally.total} trials done; to go on, {go_on}", file=sys.stderr
+            f"{stop.reason}: {progress.done} of {progress.total} trials done; to go on, {go_on}",
+            file=sys.stderr,
         )
-        return stopper.status
+        return stop.status
     if result.unrun:
         print(
             f"{pluralize(len(result.unrun), 'trial')} could not be run, and left no row: the policy was away "

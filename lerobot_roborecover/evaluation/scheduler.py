@@ -83,7 +83,7 @@ class Engine:
         self._on_row, self._videos, self._first = on_row, videos, first
         self._workers = [WorkerState(slot) for slot in slots]
         self._asked: dict[Replica, tuple[list[ActiveTrial], float]] = {}
-        self._company = {r: BatchTimer(batch_delay_s) for r in self._replicas}
+        self._timers = {r: BatchTimer(batch_delay_s) for r in self._replicas}
         self._failures: dict[str, int] = {}
         self._losses: dict[tuple[str, int], int] = {}
         self._queue = WorkQueue(())
@@ -119,7 +119,7 @@ class Engine:
             if not events:
                 break
             self._collect(events, _POLL_S)
-        for active in self._sittings():
+        for active in self._active_trials():
             if active.recording is not None:
                 active.recording.drop()
         self._write_first()
@@ -129,12 +129,12 @@ class Engine:
                 self.unrun[unit.scenario.id, unit.trial] = reasons[0]
         return self._finished
 
-    def _sittings(self) -> list[ActiveTrial]:
+    def _active_trials(self) -> list[ActiveTrial]:
         """The trials under way, in the order of their workers."""
         return [s.active for s in self._workers if s.active is not None]
 
-    def _sittings_of(self, replica: Replica) -> list[ActiveTrial]:
-        return [s for s in self._sittings() if s.replica is replica]
+    def _trials_of(self, replica: Replica) -> list[ActiveTrial]:
+        return [s for s in self._active_trials() if s.replica is replica]
 
     # --- events
 
@@ -146,13 +146,13 @@ class Engine:
             replica = self._least_busy()
             if replica is None:
                 return
-            unit = self._queue.take(worker.last, [s.unit.task for s in self._sittings()])
+            unit = self._queue.take(worker.last, [s.unit.task for s in self._active_trials()])
             if unit is None:
                 return
             self._start(worker, unit, replica)
 
     def _least_busy(self) -> Replica | None:
-        users = [s.replica for s in self._sittings()]
+        users = [s.replica for s in self._active_trials()]
         able = (r for r in self._replicas if not (r.starting or r.gone))
         return min(able, key=users.count, default=None)
 
@@ -164,11 +164,11 @@ class Engine:
         worker.slot.send("reset", trial.begin(record_video))
 
     def _ask(self, replica: Replica) -> bool:
-        """Asks a free replica about the trials that wait for it, unless more company is to be expected."""
+        """Sends a free replica the trials that wait for it, unless others are about to join the batch."""
         at = self._ask_at(replica)
         if at is None or self._clock() < at:
             return False
-        waiting = [s for s in self._sittings_of(replica) if s.waiting]
+        waiting = [s for s in self._trials_of(replica) if s.waiting]
         asking = sorted(waiting, key=lambda s: s.waiting_since)[: replica.host.max_batch]
         self._asked[replica] = asking, self._clock()
         replica.submit(
@@ -182,19 +182,19 @@ class Engine:
         """Returns when to send a batch to a replica; None where no trial waits for it, or it is busy."""
         if replica.starting or replica in self._asked:
             return None
-        mine = self._sittings_of(replica)
+        mine = self._trials_of(replica)
         waiting = [s.waiting_since for s in mine if s.waiting]
         if not waiting:
             return None
         acting = [s.answered_at for s in mine if s.working and s.answered_at is not None]
         handing_off = sum(s.working and s.answered_at is None for s in mine)
-        return self._company[replica].ask_at(waiting, acting, handing_off, replica.host.max_batch)
+        return self._timers[replica].ask_at(waiting, acting, handing_off, replica.host.max_batch)
 
     def _events(self) -> list[Event]:
         """What can happen next."""
         events: list[Event] = []
         events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
-        events += [(s.worker.slot, lambda s=s: self._replied(s)) for s in self._sittings() if s.working]
+        events += [(s.worker.slot, lambda s=s: self._replied(s)) for s in self._active_trials() if s.working]
         if len(self._queue):
             parties = [*self._replicas, *(s.slot for s in self._workers)]
             events += [(p, p.poll_startup) for p in parties if p.starting]
@@ -246,7 +246,7 @@ class Engine:
                     active.trial.on_policy_error(err, seconds=self._clock() - began)
                     active.replica = None
                     self._finish(active)
-            for active in self._sittings_of(replica):
+            for active in self._trials_of(replica):
                 active.replica = None
                 if not active.working:  # one that works is given up when its slot has replied
                     self._lost(active, str(err))
@@ -256,7 +256,7 @@ class Engine:
         if problem := count_problem(len(answers), len(asked)):
             answers = [PolicyError(problem)] * len(asked)
         seconds = self._clock() - began
-        self._company[replica].inferred(len(asked), seconds)
+        self._timers[replica].inferred(len(asked), seconds)
         for active, answer in zip(asked, answers, strict=True):
             trial, slot = active.trial, active.worker.slot
             if isinstance(answer, PolicyUnavailableError):
@@ -284,7 +284,7 @@ class Engine:
             self._lost(active, reply.message)
             return
         if isinstance(reply, ActResult) and not reply.over:
-            self._company[active.replica].simulated(active.answered_with, reply.seconds)
+            self._timers[active.replica].simulated(active.answered_with, reply.seconds)
         active.trial.on_reply(reply)
         if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
             active.recording = self._videos.begin(active.unit, reply.frame, reply.hz)

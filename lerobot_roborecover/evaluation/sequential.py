@@ -110,7 +110,7 @@ def read_reference(path: Path, scenarios: Sequence[Scenario], protocol: EvalProt
 
 
 class Watch(RunProgress):
-    """Counts trials as a tally does, and says at any time what they show.
+    """Counts trials as `RunProgress` does, and says at any time what they show.
 
     Args:
         scenarios: of the run.

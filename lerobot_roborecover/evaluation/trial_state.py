@@ -16,8 +16,6 @@ FAILURES = {
 
 
 class TrialState(StrEnum):
-    """State of a trial."""
-
     NEW = "new"
     """No request has been sent yet."""
     HANDING_OFF = "handing_off"

@@ -124,7 +124,7 @@ class ScenarioVectorEnv(gym.vector.VectorEnv):
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Advances every running trial by one step; a trial that is told to go back does so instead.
+        """Advances every running trial by one step; a trial that is to be rolled back does so instead.
 
         Args:
             actions: (num_envs, action width), or as many columns more as `control_columns.WIDTH`.

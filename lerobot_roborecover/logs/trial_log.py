@@ -35,8 +35,6 @@ class TrialLogError(RoboRecoverError, ValueError):
 
 @dataclass(frozen=True)
 class ReadLog:
-    """A log as it was read."""
-
     path: Path
     rows: tuple[TrialRow, ...]
     """One of each trial."""

@@ -17,7 +17,7 @@ import numpy as np
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.catalog import TaskCatalog
 from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
-from lerobot_roborecover.scenario import Reset, ScenarioError, Task, TrialStart
+from lerobot_roborecover.scenario import Reset, ScenarioError, Task
 
 if TYPE_CHECKING:
     from lerobot_roborecover.platforms.controls import Controls
@@ -154,14 +154,6 @@ class Platform(TaskCatalog):
             width: values in an action.
         """
         return tuple(i for i, n in enumerate(self.action_names.get(width, ())) if n.endswith("gripper"))
-
-    def check_scenario(self, scenario: TrialStart) -> None:
-        """Refuses a scenario whose actions the platform cannot execute.
-
-        Raises:
-            ScenarioError: the prefix has another width.
-        """
-        self.check_width(scenario.prefix.shape[1], f"scenario {scenario.id}")
 
     def check_width(self, width: int, where: str) -> None:
         """Refuses recorded actions of another width.

@@ -17,7 +17,7 @@ from lerobot_roborecover.scenario import ScenarioError
 AXES = ("forward", "left", "up", "roll", "pitch", "yaw")
 
 GRIPPER_SECONDS = 0.5
-"""Simulated time that passes by itself once the gripper was told to open or close."""
+"""Simulated time that passes by itself once the gripper was commanded to open or close."""
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,14 @@ def chosen_quality(quality: str) -> dict[str, str]:
     return {} if quality == "full" else {"render_quality": quality}
 
 
+def drop_pictures(config: EnvConfig) -> None:
+    """Leaves out every feature that is a picture."""
+    from lerobot.configs import FeatureType
+
+    for key in [k for k, f in config.features.items() if f.type is FeatureType.VISUAL]:
+        del config.features[key]
+
+
 def no_video(_: Observation) -> np.ndarray:
     """Returns a grey frame for a video that was not asked for, unlike any dark scene."""
     return np.full((64, 64, 3), 128, np.uint8)

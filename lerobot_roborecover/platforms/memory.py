@@ -18,7 +18,7 @@ _TRIM = _find_trim()
 
 
 def release_freed_memory() -> None:
-    """Has the allocator return what it keeps for later; does nothing where it cannot be told."""
+    """Has the allocator return what it keeps for later; does nothing where it cannot be known."""
     if _TRIM is not None:
         gc.collect()
         _TRIM(0)

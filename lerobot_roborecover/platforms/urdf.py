@@ -22,8 +22,6 @@ _DIGITS = 9
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint, as the file has it."""
-
     name: str
     kind: str
     """`revolute`, `continuous`, `prismatic`, `fixed`, ..."""

@@ -9,7 +9,7 @@ from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.utils.lerobot_versions import version_problem
 
 STAMPS = ("lerobot",)
-"""Distributions whose version is in every row, and is told apart, but not refused: LeRobot brings policies
+"""Distributions whose version is in every row, and is distinguished, but not refused: LeRobot brings policies
 and observations, and physics is in the pinned packages."""
 
 

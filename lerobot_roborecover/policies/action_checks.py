@@ -68,7 +68,7 @@ def tensor_problem(values: Any, batch: int, ndim: int, width: int | None) -> str
 
 
 def count_problem(given: int, asked: int) -> str:
-    """Returns why answers cannot be told apart; empty if there is one for each trial.
+    """Returns why answers cannot be distinguished; empty if there is one for each trial.
 
     Args:
         given: answers, or rows of actions.

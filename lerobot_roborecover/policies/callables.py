@@ -90,7 +90,7 @@ def callable_metadata(policy: Callable[..., Any], name: str, **others: Any) -> P
     except UnhashableError as err:
         identity = f"{POLICY_TYPE}@run-{secrets.token_hex(6)}"
         logger.warning(
-            "policy %s cannot be told from a changed one (%s): its rows are not reused by a later run",
+            "policy %s cannot be identified (%s): its rows are not reused by a later run",
             name,
             err,
         )

@@ -83,7 +83,7 @@ class RollbackHistory:
         if self._keep:
             self._states.append(self._simulator.state_sha256())
 
-    def back(self, steps: int) -> RollbackResult:
+    def roll_back(self, steps: int) -> RollbackResult:
         """Goes back, at most to where an initial-state trial would start.
 
         Args:

@@ -57,7 +57,6 @@ class RobotSession:
 
     @property
     def joint_limits(self) -> dict[str, tuple[float, float]]:
-        """`limits` as pairs."""
         return {name: (values[0], values[1]) for name, values in self.limits.items()}
 
 

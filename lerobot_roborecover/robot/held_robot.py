@@ -32,12 +32,10 @@ class HeldRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether the robot answers."""
         return self.held.is_connected
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the robot is."""
         return self.held.is_calibrated
 
     def connect(self, calibrate: bool = True) -> None:

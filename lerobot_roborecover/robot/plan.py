@@ -41,8 +41,6 @@ MAX_REPEATS = 1000
 
 @dataclass(frozen=True)
 class PlannedPolicy:
-    """A policy of a plan."""
-
     path: str
     """Checkpoint folder or Hub id."""
     overrides: tuple[str, ...] = ()

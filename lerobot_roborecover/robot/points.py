@@ -70,7 +70,6 @@ class RobotPoint:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
         return tuple(self.pictures)
 
 

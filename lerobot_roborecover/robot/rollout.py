@@ -24,8 +24,6 @@ FROZEN_AFTER_S = 1.0
 
 @dataclass
 class RolloutEnd:
-    """How a rollout ended."""
-
     steps: int = 0
     """Actions that were sent, a person's included."""
     duration_s: float = 0.0

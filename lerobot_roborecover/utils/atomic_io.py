@@ -210,7 +210,7 @@ def _at_work(lock: Path, process: int) -> bool:
 
 
 def _identity(process: int) -> str:
-    """Names a process of this machine, so that a later one with the same number is told from it."""
+    """Names a process of this machine, so that a later one with the same number is distinguished from it."""
     try:
         # Field 22 is when it began; the name in field 2 may hold spaces and brackets.
         began = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]

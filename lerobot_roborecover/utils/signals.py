@@ -42,7 +42,6 @@ def exit_status(number: int) -> int:
 
 
 def raise_terminated(number: int, _frame: FrameType | None = None) -> None:
-    """A handler that raises `Terminated`."""
     raise Terminated(number)
 
 

@@ -54,7 +54,6 @@ class Backend:
 
     @property
     def on_cluster(self) -> bool:
-        """Whether it is a cluster."""
         return self.engine == "ray"
 
     def option(self, name: str) -> str:

@@ -102,8 +102,6 @@ class EpisodeStart:
 
 @dataclass(frozen=True)
 class StepResult:
-    """Reply to a step."""
-
     observation: dict[str, Any]
     success: bool
     seconds: float

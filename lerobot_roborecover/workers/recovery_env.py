@@ -74,7 +74,6 @@ class RecoveryEnv(gym.Env):
     ):
         self.scenario = scenario
         self._platform = platform_named(scenario.platform)
-        self._platform.check_scenario(scenario)
         self.render_mode = render_mode
         self._start = Start(start)
         self._rewind_steps = resolve_rewind_steps(scenario, rewind_steps)
@@ -85,7 +84,7 @@ class RecoveryEnv(gym.Env):
         self._control_mode = control_mode
         self._rollback_steps = rollback_steps
         self._played, self._spent = played, spent
-        self._trail: RollbackHistory | None = None
+        self._history: RollbackHistory | None = None
         self.metadata = {**self.metadata, "render_fps": int(self._simulator.control_hz)}
         self.observation_space = self._simulator.observation_space
         self.action_space = self._platform.action_space(self._simulator.action_dim)
@@ -110,7 +109,7 @@ class RecoveryEnv(gym.Env):
             check=self._check,
             cache=self._cache,
         )
-        self._trail = RollbackHistory(
+        self._history = RollbackHistory(
             self._simulator,
             self.scenario.rollout,
             self.handoff.step,
@@ -119,7 +118,7 @@ class RecoveryEnv(gym.Env):
             control_mode=self._control_mode,
         )
         if self._played is not None and self.handoff.problem is None:
-            advance(self._trail, self._played)
+            advance(self._history, self._played)
         return self._simulator.observe(), {"is_success": False, "handoff": asdict(self.handoff)}
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
@@ -146,8 +145,8 @@ class RecoveryEnv(gym.Env):
 
     def advance(self, action: np.ndarray) -> bool:
         """The step without the observation; returns the predicate."""
-        trail = self._running()
-        trail.step(np.asarray(action))
+        history = self._running()
+        history.step(np.asarray(action))
         self._steps += 1
         return self._simulator.succeeded()
 
@@ -164,24 +163,24 @@ class RecoveryEnv(gym.Env):
         Raises:
             SimulatorError: the state could not be had again.
         """
-        trail = self._running()
+        history = self._running()
         began = time.perf_counter()
-        rewound = trail.back(steps)
-        self._undone += rewound.undone
+        result = history.roll_back(steps)
+        self._undone += result.undone
         solved = self._simulator.succeeded()
         observation = self._simulator.observe()
         seconds = time.perf_counter() - began
         return RollbackReply(
-            observation, rewound.distance, rewound.undone, rewound.method, seconds, solved,
+            observation, result.distance, result.undone, result.method, seconds, solved,
             progress=self.progress(),
         )  # fmt: skip
 
     def _running(self) -> RollbackHistory:
-        if self.handoff is None or self._trail is None:
+        if self.handoff is None or self._history is None:
             raise SimulatorError("step before reset")
         if self.handoff.problem is not None:
             raise HandoffError(f"{self.scenario.id}: {self.handoff.problem.value}: {self.handoff.reason}")
-        return self._trail
+        return self._history
 
     def render(self) -> np.ndarray:
         """(H, W, 3) uint8 upright picture after the last step or reset."""

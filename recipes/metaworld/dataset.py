@@ -50,7 +50,7 @@ STUDY_TASKS = (
     "soccer-v3",
     "stick-push-v3",
 )
-"""Tasks of the study's policies: one object to handle, told apart by the state, solved by the scripted
+"""Tasks of the study's policies: one object to handle, distinguished by the state, solved by the scripted
 policies in at least five of six resets."""
 
 FIRST_SEED = 10_000

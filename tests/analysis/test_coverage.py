@@ -238,10 +238,10 @@ def test_one_estimator_behind_every_table(tmp_path, capsys):
     row = dict(zip([c.title for c in overall(plain).columns], overall(plain).rows[0], strict=True))
     (board,) = make_leaderboard(tmp_path / "logs").boards
     both = compare(read_study([str(path), str(other)]))
-    tally = RunProgress("recovery", {r.scenario_id for r in rows}, 3)
-    tally.add([asdict(r) for r in rows])
+    counts = RunProgress("recovery", {r.scenario_id for r in rows}, 3)
+    counts.add([asdict(r) for r in rows])
     assert run.rsr == row["RSR %"] == board.entries[0].rsr == both.rsr[0]
-    assert tally.interval == (run.rsr.low, run.rsr.high)
+    assert counts.interval == (run.rsr.low, run.rsr.high)
     assert run.macro == row["Macro-4 %"] == board.entries[0].macro
     by_trajectory = analyse(plain.study, Options(cluster=ResamplingUnit.TRAJECTORY))
     wide = by_trajectory.ranked_rates[0]

@@ -85,9 +85,9 @@ def test_every_table_has_the_initial_rate_of_first_states(tmp_path):
     assert "90 scenarios branch off from 40 first states" in format_table(summarise(rows))
     (board,) = make_leaderboard(tmp_path).boards
     assert {e.policy: e.initial for e in board.entries}["a"] == rate
-    tally = RunProgress("initial", {r["scenario_id"] for r in rows}, 1)
-    tally.add(rows)
-    assert (tally.rate, tally.interval) == (rate.value, (rate.low, rate.high))
+    counts = RunProgress("initial", {r["scenario_id"] for r in rows}, 1)
+    counts.add(rows)
+    assert (counts.rate, counts.interval) == (rate.value, (rate.low, rate.high))
     shown = {c.title: v for c, v in zip(overall(results).columns, overall(results).rows[0], strict=True)}
     assert shown["Initial state %"] == initial_estimates(results)[0]
     assert "40 first states" in overall(results).notes[0]

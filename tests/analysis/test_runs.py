@@ -156,7 +156,7 @@ def test_of_methods_nothing_is_said_with_three_runs_and_something_with_more(tmp_
 
 
 def test_runs_that_scatter_separate_runs_but_not_methods(tmp_path):
-    """Four runs each: on many scenarios their means are told apart, though both have runs everywhere."""
+    """Four runs each: on many scenarios their means are distinguished, though both have runs everywhere."""
     logs = [
         method(tmp_path, "a", (0.95, 0.9, 0.3, 0.55), count=80, trials=5),
         method(tmp_path, "b", (0.7, 0.05, 0.5, 0.4), count=80, trials=5),

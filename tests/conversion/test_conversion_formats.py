@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_roborecover.datasets.task_lookup import task_by_instruction, task_by_name
 from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.conversion_scripts import script
@@ -316,7 +316,7 @@ def recorded(tmp_path_factory):
                     "next.reward": np.zeros(1, np.float32),
                     "next.success": np.array([episode == 1 and step == 4]),
                     "next.done": np.zeros(1, bool),
-                    "task": task_by_name("metaworld", "button-press-v3").instruction,
+                    "task": platform_named("metaworld").task("button-press-v3").instruction,
                 }
             )
         dataset.save_episode()
@@ -370,7 +370,7 @@ def test_rollouts_are_of_the_task_of_their_index_wherever_its_row_is(tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     names = ["button-press-v3", "door-open-v3", "drawer-close-v3"]
-    tasks = [task_by_name("metaworld", name).instruction for name in names]
+    tasks = [platform_named("metaworld").task(name).instruction for name in names]
     root = lerobot_folder(tmp_path / "recording", tasks)
     write_tasks(root, [tasks[i] for i in (2, 0, 1)], [2, 0, 1])
     assert convert_rollouts(root, tmp_path / "out") == 0
@@ -395,13 +395,13 @@ def test_a_column_actions_is_refused_in_one_line(tmp_path, capsys, column):
 
 
 def test_tasks_are_found_by_name_and_by_instruction():
-    assert task_by_name("libero", TASK).suite == "libero_goal"
-    assert task_by_instruction("libero", "Put the bowl  on the plate").name == TASK
-    assert task_by_name("robotwin", "open_microwave", "open it").horizon == 1500
+    assert platform_named("libero").task(TASK).suite == "libero_goal"
+    assert platform_named("libero").task_by_instruction("Put the bowl  on the plate").name == TASK
+    assert platform_named("robotwin").task("open_microwave", "open it").horizon == 1500
     for call, words in (
-        (lambda: task_by_name("libero", "fly"), "libero has no task 'fly'; there are "),
-        (lambda: task_by_name("robotwin", "../x"), "not one of RoboTwin's 50 tasks"),
-        (lambda: task_by_instruction("libero", "fly"), "0 tasks"),
+        (lambda: platform_named("libero").task("fly"), "libero has no task 'fly'; there are "),
+        (lambda: platform_named("robotwin").task("../x"), "not one of RoboTwin's 50 tasks"),
+        (lambda: platform_named("libero").task_by_instruction("fly"), "0 tasks"),
     ):
         with pytest.raises(ScenarioError, match=words):
             call()

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.screen.runs import forget_trials, parse_policies, take_trials
-from lerobot_roborecover.curation.screen.screening import ScreenRule, provenance_of, screen, tally
+from lerobot_roborecover.curation.screen.screening import ScreenRule, count_outcomes, provenance_of, screen
 from lerobot_roborecover.curation.screen.tables import (
     format_histogram,
     format_policies,
@@ -148,10 +148,10 @@ def test_curtailing_keeps_the_same_scenarios(data):
     order = data.draw(st.permutations([r for n in NAMES for r in rows[n][: 1 if n in certain else 5]]))
     seen, settled, soonest = {name: [] for name in NAMES}, False, 0
     for run, row in enumerate(order, start=1):
-        (before,) = tally([scenario], seen, rule, certain)
+        (before,) = count_outcomes([scenario], seen, rule, certain)
         soonest = max(soonest, run - 1 + before.soonest) if not certain else soonest
         seen[row.policy[0]].append(row)
-        (found,) = tally([scenario], seen, rule, certain)
+        (found,) = count_outcomes([scenario], seen, rule, certain)
         if found.settled:
             assert run >= 3
             assert run >= soonest
@@ -168,7 +168,7 @@ def test_curtailing_keeps_the_same_scenarios(data):
 def test_where_a_curtailed_screening_stops():
     scenario, rule = fake_scenario(0), ScreenRule(curtail=True)
     rows = {name: [] for name in NAMES}
-    (none,) = tally([scenario], rows, rule, "abc")
+    (none,) = count_outcomes([scenario], rows, rule, "abc")
     assert (none.settled, none.soonest) == (False, 4)
     # One success and one failure of those that count five times each settle it, once there are three.
     mixed = rows_with(scenario, {"a": 5, "b": 0, "c": 0, "d": 0}, trials=1) | {"d": []}
@@ -181,7 +181,7 @@ def test_where_a_curtailed_screening_stops():
     assert provenance_of(found, 0)["planned"] == 20
     # Three that never recover leave it to the fourth: two successes keep it, four failures drop it.
     never = rows_with(scenario, dict.fromkeys(NAMES, 0), trials=1) | {"d": []}
-    (found,) = tally([scenario], never, rule, "abc")
+    (found,) = count_outcomes([scenario], never, rule, "abc")
     assert (found.settled, found.soonest) == (False, 2)
     lost = never | {"d": rows_with(scenario, dict.fromkeys(NAMES, 0), trials=4)["d"]}
     (found,) = screen([scenario], lost, rule, "abc")

@@ -74,10 +74,10 @@ def test_a_forks_state_is_the_parents_bit_for_bit():
                 assert env.simulator.state_sha256() == hashes[step - back]
             else:  # as a rollback of a running trial goes
                 hand_off(whole.simulator, scenario)
-                trail = RollbackHistory(whole.simulator, scenario.rollout, len(scenario.prefix))
+                history = RollbackHistory(whole.simulator, scenario.rollout, len(scenario.prefix))
                 for action in actions[:step]:
-                    trail.step(action)
-                trail.back(back)
+                    history.step(action)
+                history.roll_back(back)
                 assert env.simulator.state_sha256() == whole.simulator.state_sha256()
             assert trial.steps == step
             assert np.array_equal(trial.actions, actions[:step].reshape(-1, 2))

@@ -80,7 +80,7 @@ def test_more_slots_than_cores_pay_under_a_slow_policy():
 
 
 def test_a_fast_policy_is_not_waited_for():
-    """Company is worth waiting for by what an inference takes."""
+    """Others are worth waiting for by what an inference takes."""
     world, _ = schedule(8, 8, 0.002)
     assert world.now < 1.1 * (world.core_s / 8 + 12 * CHUNK * 0.010)
 
@@ -103,51 +103,51 @@ def test_a_batch_that_cannot_hold_all_is_not_waited_for_longer():
     assert host.busy_s > 0.98 * world.now
 
 
-def _company(fixed_s: float, each_s: float, simulation_s: float) -> BatchTimer:
+def _timer(fixed_s: float, each_s: float, simulation_s: float) -> BatchTimer:
     """One that has seen inferences for four and for eight of eight."""
-    company = BatchTimer(0.01)
+    timer = BatchTimer(0.01)
     for batch in (4, 8, 4, 8):
-        company.inferred(batch, fixed_s + batch * each_s)
-        company.simulated(8, simulation_s)
-    return company
+        timer.inferred(batch, fixed_s + batch * each_s)
+        timer.simulated(8, simulation_s)
+    return timer
 
 
 @given(
     st.floats(0.001, 2), st.floats(0, 0.2), st.floats(0.001, 4), st.integers(1, 7),
 )  # fmt: skip
-def test_company_is_waited_for_where_an_inference_costs_more_than_it(fixed_s, each_s, simulation_s, waiting):
+def test_others_are_waited_for_where_an_inference_costs_more_than_it(fixed_s, each_s, simulation_s, waiting):
     assume(abs(fixed_s - simulation_s) > 1e-3 * fixed_s)
-    company = _company(fixed_s, each_s, simulation_s)
-    at = company.ask_at([10.0] * waiting, [10.0] * (8 - waiting), 0, 64)
+    timer = _timer(fixed_s, each_s, simulation_s)
+    at = timer.ask_at([10.0] * waiting, [10.0] * (8 - waiting), 0, 64)
     if simulation_s < fixed_s:
         assert at == pytest.approx(10 + simulation_s + 0.01)
     else:
-        assert at == (10.0 if waiting >= 4 else 10 + company.delay_s)
+        assert at == (10.0 if waiting >= 4 else 10 + timer.delay_s)
 
 
 def test_a_simulator_that_hangs_is_not_waited_for():
-    company = _company(1.0, 0.0, 0.5)
-    assert company.ask_at([30.0] * 7, [10.0], 0, 64) == pytest.approx(10.51), "long ago"
-    assert company.ask_at([30.0] * 7, [], 1, 64) == 30, "nor one that rebuilds a start"
+    timer = _timer(1.0, 0.0, 0.5)
+    assert timer.ask_at([30.0] * 7, [10.0], 0, 64) == pytest.approx(10.51), "long ago"
+    assert timer.ask_at([30.0] * 7, [], 1, 64) == 30, "nor one that rebuilds a start"
 
 
 def test_before_batches_differ_all_are_asked_about_together_once():
-    company = BatchTimer(0.01)
+    timer = BatchTimer(0.01)
     for _ in range(3):
-        company.inferred(4, 1.0)
-        company.simulated(4, 0.2)
-    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == pytest.approx(10.41), "the cores may be shared"
+        timer.inferred(4, 1.0)
+        timer.simulated(4, 0.2)
+    assert timer.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == pytest.approx(10.41), "the cores may be shared"
     for _ in range(2):
-        company.inferred(8, 1.9)  # an observation more is what costs
-    assert company.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == 10
+        timer.inferred(8, 1.9)  # an observation more is what costs
+    assert timer.ask_at([10.0] * 4, [10.0] * 4, 0, 64) == 10
 
 
 def test_the_first_inference_which_compiles_makes_nobody_patient():
-    company = BatchTimer(0.01)
-    company.inferred(1, 60.0)
-    assert company.delay_s <= 0.25
-    company.inferred(1, 0.01)
-    assert company.delay_s == pytest.approx(0.01)
+    timer = BatchTimer(0.01)
+    timer.inferred(1, 60.0)
+    assert timer.delay_s <= 0.25
+    timer.inferred(1, 0.01)
+    assert timer.delay_s == pytest.approx(0.01)
 
 
 def test_default_slots_follow_cores_memory_and_the_policys_device():

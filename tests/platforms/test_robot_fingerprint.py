@@ -12,7 +12,7 @@ import pytest
 
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets.release.robot import check_robot
-from lerobot_roborecover.evaluation.session import _check_versions
+from lerobot_roborecover.evaluation.session_checks import check_versions
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
 from lerobot_roborecover.platforms.robot_fingerprint import SAME, compare_robots
@@ -173,18 +173,18 @@ def test_a_run_is_refused_before_it_starts(other_root, caplog):
     with pytest.raises(
         OptionError, match=r"\(and 2 more\) was recorded on another robot than the aloha-agilex"
     ):
-        _check_versions(scenarios, "robotwin", here, True)
-    _check_versions(scenarios, "robotwin", RobotwinCheckout(ROOT).robot.fingerprint, True)
+        check_versions(scenarios, "robotwin", here, True)
+    check_versions(scenarios, "robotwin", RobotwinCheckout(ROOT).robot.fingerprint, True)
     assert "robot" not in caplog.text
     mark = scenarios[0].fingerprint
     versions = {k: v for k, v in mark.versions.items() if not k.startswith("robot")}
     old = replace(scenarios[0], fingerprint=replace(mark, versions=versions))
-    _check_versions([old], "robotwin", here, True)
+    check_versions([old], "robotwin", here, True)
     assert "does not say which robot recorded it" in caplog.text
     caplog.clear()
     meshes = {**here, **RobotwinCheckout(ROOT).robot.fingerprint, "robot_mesh.hand.stl": "n"}
     was = {**mark.versions, "robot_mesh.hand.stl": "m"}
-    _check_versions([replace(old, fingerprint=replace(mark, versions=was))], "robotwin", meshes, True)
+    check_versions([replace(old, fingerprint=replace(mark, versions=was))], "robotwin", meshes, True)
     assert "its mesh hand.stl is n, not m" in caplog.text
 
 

@@ -50,7 +50,7 @@ STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1}
 
 @pytest.mark.parametrize("name", builtin_names())
 def test_every_shipped_state_has_its_hash(name):
-    """Without it no handoff can be told to be the recorded one, bit for bit."""
+    """Without it no handoff can be known to be the recorded one, bit for bit."""
     found = load_scenarios(name)
     assert len(found) > 0
     assert [s.id for s in found if s.fingerprint is None or not s.fingerprint.state_sha256] == []

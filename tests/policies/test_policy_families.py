@@ -166,7 +166,7 @@ def ask(host, seeds: list[int], observations: list[dict], rounds: int = 2) -> li
 
 
 @pytest.mark.parametrize("family", EVERY)
-def test_a_trials_actions_do_not_depend_on_its_company(checkpoint, family, monkeypatch):
+def test_a_trials_actions_do_not_depend_on_its_batch(checkpoint, family, monkeypatch):
     """Nor on the order. X-VLA's noise is drawn inside, per batch: with that held, neither do its actions."""
     import torch
 

@@ -92,7 +92,7 @@ def test_clients_with_other_cameras_or_sizes_are_not_one_batch():
         {"observation.images.a": picture(5)},
     ]
     policy = Cameras()
-    # The delay is longer than any test may take: only a complete company is answered.
+    # The delay is longer than any test may take: only a complete batch is answered.
     with serving(policy, batch_delay_s=600.0) as (url, _), ThreadPoolExecutor(4) as threads:
         clients = [connect(url) for _ in observations]
 

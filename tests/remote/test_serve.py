@@ -143,7 +143,7 @@ def test_requests_that_come_together_are_inferred_together(checkpoints, monkeypa
     policy = load(checkpoints, "act")
     sizes, whole = [], policy.act
     monkeypatch.setattr(policy, "act", lambda o, i, h: sizes.append(len(o)) or whole(o, i, h))
-    # The delay is longer than any test may take: only a complete company is answered.
+    # The delay is longer than any test may take: only a complete batch is answered.
     with serving(policy, batch_delay_s=600.0) as (url, _), ThreadPoolExecutor(4) as threads:
         clients = [websockets.sync.client.connect(url) for _ in range(4)]
         for client in clients:

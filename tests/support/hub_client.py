@@ -69,7 +69,7 @@ class HubClient:
         return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
     def roborecover(self, *args: object, **settings) -> subprocess.CompletedProcess:
-        """Runs the command line, logged in unless told otherwise."""
+        """Runs the command line, logged in unless an option says otherwise."""
         return self.run(CLI, *args, **{"token": TOKEN, **settings})
 
     def publish(self, root: Path, *args: object, status: int = 0, **settings) -> subprocess.CompletedProcess:

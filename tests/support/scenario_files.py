@@ -24,7 +24,7 @@ def png(width: int = 2, height: int = 2) -> bytes:
 
 
 def bits(scenario: Scenario) -> tuple:
-    """Everything of a scenario in a form in which equal means bit-identical, -0.0 told apart from 0.0."""
+    """Everything of a scenario in a form in which equal means bit-identical, -0.0 distinguished from 0.0."""
     mark, reset = scenario.fingerprint, scenario.reset
     return (
         scenario.id,

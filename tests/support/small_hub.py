@@ -42,7 +42,7 @@ def _repo(cache: Path, repo: str) -> Path:
 
 
 def _tokenizer(folder: Path, extra: dict[str, str] | None = None) -> Any:
-    """One token a character; any text can be told from any other."""
+    """One token a character; any text can be distinguished from any other."""
     from tokenizers import Tokenizer, decoders, models
     from transformers import PreTrainedTokenizerFast
 

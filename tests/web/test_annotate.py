@@ -26,8 +26,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import queued
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.journal import read_journal
-from lerobot_roborecover.web.annotate.identity import names_of
-from lerobot_roborecover.web.annotate.queue import queue_order
+from lerobot_roborecover.web.annotate.identity import names_of, queue_order
 from lerobot_roborecover.web.annotate.serve import AnnotateConfig, serve
 from lerobot_roborecover.web.annotate.server import AnnotationStudy, VotingSession, make_app
 from lerobot_roborecover.web.guard import MAX_BODY_BYTES, cookie_name

@@ -15,8 +15,7 @@ from lerobot_roborecover.curation.annotation.discussion import Discussion
 from lerobot_roborecover.curation.annotation.votes import Vote, ballot
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.utils.journal import read_journal
-from lerobot_roborecover.web.annotate.identity import names_of
-from lerobot_roborecover.web.annotate.queue import queue_order
+from lerobot_roborecover.web.annotate.identity import names_of, queue_order
 from tests.support.browser import browsing
 from tests.support.candidate_files import CAMERAS, SIDE, STEPS, candidate_dataset
 from tests.support.processes import PATIENCE_S

@@ -96,12 +96,12 @@ def check_exact(platform, task, moves, width, **options) -> None:
             for _ in range(move):
                 session.act(rng.uniform(-1, 1, width), "script")
         else:
-            session.back(-move)
+            session.roll_back(-move)
     assert len(session.bodies) == len(session.solved) == session.step + 1
     assert states(make_simulator(platform, **options), start, session.actions)[-1] == simulator.state_sha256()
     assert session.bodies[-1] == simulator.bodies()
     if session.step:
-        session.back(1)
+        session.roll_back(1)
         session.act(last := rng.uniform(-1, 1, width), "script")
         again = states(make_simulator(platform, **options), start, [*session.actions[:-1], last])
         assert again[-1] == simulator.state_sha256()
@@ -188,7 +188,7 @@ def test_a_rollout_is_continued_from_any_of_its_steps(tmp_path):
     recorded = read_candidates(dataset).steps(1).bodies["puck"][20, :3]
     assert session.bodies[-1]["puck"].position_m == tuple(recorded)
     session.act(np.array([1.0, 0.0]), "script")
-    assert session.back(50) == 1, "what came before was not driven here"
+    assert session.roll_back(50) == 1, "what came before was not driven here"
     session.act(np.array([1.0, 0.0]), "script")
     saved = session.recorded("x", as_dropped=True)
     assert saved.source_record == "ep-0001"

@@ -4,19 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_roborecover.analysis.figures.style import (
-    LINE,
-    Figure,
-    Plot,
-    Width,
-    both,
-    colour,
-    dash,
-    drawing,
-    marker,
-    number,
-    short,
-)
+from lerobot_roborecover.analysis.figures import style
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.retry_tables import retried
 from lerobot_roborecover.analysis.stats.resampling import masked_mean
@@ -26,7 +14,7 @@ MOST_LINES = 16
 """Policies and interventions that the figure shows, the best first."""
 
 
-def retries(results: Results) -> Figure | None:
+def retries(results: Results) -> style.Figure | None:
     """Success with retries against steps; None where every scenario has one trial."""
     every = [one.attempts for one in retried(results) if one.attempts.most > 1][:MOST_LINES]
     if not every:
@@ -35,23 +23,25 @@ def retries(results: Results) -> Figure | None:
     grid = np.linspace(0, most, 20 * most + 1)
     curves = [masked_mean(rates_for_steps(one, grid)) for one in every]
 
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
+    def draw(width: style.Width) -> style.Plot:
+        with style.drawing() as subplots:
             plot, axes = subplots(width.inches, 3.4 + 0.24 * len(every) if width.narrow else 4.2)
             for p, (one, curve) in enumerate(zip(every, curves, strict=True)):
-                style = {"ls": dash(p), "color": colour(p), "marker": marker(p), "markevery": 20}
-                axes.plot(grid, 100 * curve, lw=2, label=short(one.title, width.names), **style)
+                line = {"ls": style.dash(p), "color": style.colour(p), "marker": style.marker(p)}
+                axes.plot(
+                    grid, 100 * curve, lw=2, label=style.short(one.title, width.names), markevery=20, **line
+                )
             steps = "steps of all attempts, in horizons of the scenario"
             axes.set(xlim=(0, most), ylim=(0, 100), xlabel=steps, ylabel="recovered, %")
             axes.set_xticks(range(most + 1))
-            axes.grid(color=LINE, lw=0.6)
+            axes.grid(color=style.LINE, lw=0.6)
             plot.legend(loc="outside lower left" if width.narrow else "outside right upper")
         return plot
 
     words = "; ".join(
-        f"{one.title} {number(100 * curve[20])} with one attempt, "
-        f"{number(100 * curve[20 * one.most if one.most < most else -1])} with {min(one.most, most)}"
+        f"{one.title} {style.number(100 * curve[20])} with one attempt, "
+        f"{style.number(100 * curve[20 * one.most if one.most < most else -1])} with {min(one.most, most)}"
         for one, curve in zip(every, curves, strict=True)
     )
     text = f"Recovered scenarios in per cent against the steps of all attempts: {words}."
-    return Figure("retries", "What a retry is worth", text, *both(draw))
+    return style.Figure("retries", "What a retry is worth", text, *style.both(draw))

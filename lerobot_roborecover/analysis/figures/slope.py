@@ -24,7 +24,7 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 
 MOST_POLICIES = 12
-"""Policies that the graph shows, the best at recovery first: more lines cannot be told apart."""
+"""Policies that the graph shows, the best at recovery first: more lines cannot be distinguished."""
 _INCHES = 7.2
 """Width for a page: it stands beside videos."""
 _GAP = 0.09

@@ -152,7 +152,6 @@ def name_rows(axes: Axes, names: Sequence[str], width: Width) -> None:
 
 
 def row_height(width: Width, wide: float = 0.36) -> float:
-    """Inches for one row."""
     return 0.52 if width.narrow else wide
 
 

@@ -18,7 +18,7 @@ from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 SIGNS = {"success": "●", "failure": "○", "invalid": "!"}
-"""Told apart by shape, not by colour."""
+"""Distinguished by shape, not by colour."""
 OUTCOME_CLASSES = {
     "split": "some policies solve it",
     "none": "no policy solves it",
@@ -30,8 +30,6 @@ OUTCOME_CLASSES = {
 
 @dataclass(frozen=True)
 class PolicyMarks:
-    """One policy on one scenario."""
-
     policy: str
     signs: str
     """One sign a trial, in their order."""
@@ -69,8 +67,6 @@ class TrialVideo:
 
 @dataclass(frozen=True)
 class Card:
-    """One scenario."""
-
     id: str
     instruction: str
     task: str

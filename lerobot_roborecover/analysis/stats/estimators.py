@@ -94,7 +94,7 @@ def scenario_rates(
         if count > 1:
             raise RowsError(
                 f"trial {trial} of {scenario} occurs {count} times. Rows of several policies, starts or "
-                "settings must be told apart first (fields `policy`, `start`, `config_hash`)"
+                "settings must be distinguished first (fields `policy`, `start`, `config_hash`)"
             )
     ids = tuple(sorted(by_scenario))
     groups = [by_scenario[i] for i in ids]

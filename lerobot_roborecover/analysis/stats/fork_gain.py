@@ -36,8 +36,6 @@ MATCHED = "matched"
 
 @dataclass(frozen=True)
 class ForkNote:
-    """Which fork a row is of."""
-
     of: str
     """`config_hash` of the logged trial's row; its scenario and its trial are the row's own."""
     actions_sha256: str
@@ -108,12 +106,10 @@ class ForkGains:
 
     @property
     def steps(self) -> list[int]:
-        """Those with a fork."""
         return sorted({p.note.step for p in self.pairs})
 
     @property
     def cells(self) -> list[str]:
-        """Those with a fork."""
         return sorted({p.cell for p in self.pairs})
 
     def of(

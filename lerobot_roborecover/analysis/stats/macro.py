@@ -54,7 +54,6 @@ class MacroCells:
 
     @property
     def counted(self) -> tuple[str, ...]:
-        """Cells that Macro averages."""
         return tuple(cell for cell, size in self.sizes.items() if size >= LEAST_IN_CELL)
 
     @property

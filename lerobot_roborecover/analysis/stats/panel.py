@@ -139,7 +139,6 @@ class Panel:
         return tuple(c for c in CELLS if c in found) if name == "cell" else tuple(sorted(found))
 
     def arm(self, title: str) -> int:
-        """Index of an arm."""
         return self.arms.index(title)
 
 

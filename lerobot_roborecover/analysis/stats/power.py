@@ -280,7 +280,7 @@ def guess_from(panel: Panel, rate: float | None = None, correlation: float | Non
         correlation: instead of the pilot's; half where the pilot has one policy.
 
     Raises:
-        RowsError: no scenario has two trials, so that scenarios cannot be told from trials.
+        RowsError: no scenario has two trials, so that scenarios cannot be distinguished from trials.
     """
     splits = [variance_split(panel.successes[p], panel.trials[p]) for p in range(min(len(panel.arms), 2))]
     if any(math.isnan(s.between) for s in splits):

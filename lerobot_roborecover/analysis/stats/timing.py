@@ -1,7 +1,7 @@
 """Time to recover: how RSR grows with the step budget, from trials run at the full one.
 
 A trial that succeeded at step s would have succeeded with any budget of at least s, because a policy is not
-told its budget; so one evaluation gives the RSR at every smaller budget.
+informed of its budget; so one evaluation gives the RSR at every smaller budget.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def unit_labels(
         unit: which.
         ids: N scenario ids.
         clusters: N trajectory clusters; empty where a scenario has none.
-        tasks: N tasks, told apart across suites.
+        tasks: N tasks, distinguished across suites.
         first_states: N hashes of first states, empty where one is not known; none takes all for unknown.
     """
     if unit is ResamplingUnit.TASK:

@@ -53,7 +53,7 @@ def annotate(
 
     Args:
         dataset: a candidate dataset.
-        say: told the progress.
+        say: called with the progress.
         annotators: names of `LABELERS`.
         votes: folder of all votes; by default inside the dataset.
         only: a list of candidates to discuss (`roborecover curate agree --discuss`).

@@ -73,12 +73,12 @@ class EpisodeFeatures:
         return None if any(v is None for v in found) else np.array(found, dtype=float)
 
     def grips(self) -> bool:
-        """Whether a gripper is told anything at all."""
+        """Whether a gripper is commanded at all."""
         first = self.readings[int(self.frames()[0])][HAND]
         return any(name != "speed" for name in first)
 
     def closed(self) -> np.ndarray:
-        """(n,) bool: the gripper is told to close; all True where it has no command of its own."""
+        """(n,) bool: the gripper is commanded to close; all True where it has no command of its own."""
         first = self.readings[int(self.frames()[0])][HAND]
         names = [name for name in first if name != "speed"]
         commands = [self.values(HAND, name) for name in names]

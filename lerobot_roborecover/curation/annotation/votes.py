@@ -31,7 +31,7 @@ DISCARD_REASONS: dict[str, str] = {
     "irreversible": "Task damaged for good, e.g. an object fell off the table",
     "stuck": "The robot can no longer interact properly",
     "not_still": "On a real robot: never at rest, so that a hand could put it back",
-    "unclear": "Cannot be told from the video",
+    "unclear": "Cannot be decided from the video",
     "other": "Something else: say it in the comment",
 }
 """Why a trajectory yields no scenario (paper, "Natural Scenarios" and "Stage-Type and Recovery Point

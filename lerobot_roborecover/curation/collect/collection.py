@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Collected:
-    """Result of a collection."""
-
     out: Path | None
     """The dataset; None where nothing was kept."""
     rows: tuple[StageCounts, ...]

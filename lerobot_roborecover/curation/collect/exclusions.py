@@ -36,8 +36,8 @@ LIMIT_RAD = 0.01
 LIMIT_STEPS = 60
 """Last steps of a rollout, at least, in which a joint is at its limit and the end effector stays."""
 PRESSING_SHARE = 0.8
-"""Last part of a rollout, at least, in which the end effector is told to move and stays. That a policy ends
-stuck is an ordinary failure, with a recovery point before it; here there is next to nothing before it."""
+"""Last part of a rollout, at least, in which the end effector is commanded to move and stays. That a policy
+ends stuck is an ordinary failure, with a recovery point before it; here there is almost nothing."""
 PRESSING_COMMAND = 0.5
 """Translation of a command, (-1 to 1), that asks for motion."""
 STAYS_M = 0.02
@@ -179,7 +179,7 @@ def _pressing(record: Record) -> str:
     steps = _trailing(asked & _stays(record)[1:])
     if steps >= PRESSING_SHARE * len(asked):
         return (
-            f"the end effector is told to move (at least {PRESSING_COMMAND:g}) and stays within "
+            f"the end effector is commanded to move (at least {PRESSING_COMMAND:g}) and stays within "
             f"{1e3 * STAYS_M:.0f} mm in the last {steps} of {len(asked)} steps (limit {PRESSING_SHARE:.0%})"
         )
     return ""

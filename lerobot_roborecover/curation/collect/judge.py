@@ -41,8 +41,6 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class RolloutVerdict:
-    """What becomes of a rollout."""
-
     planned: RolloutSpec
     dropped: Decision | None
     """Why it is no candidate; None where it is one."""

@@ -102,7 +102,7 @@ class RolloutJournal:
 
 
 type OnEnd = Callable[[RolloutOutcome, bytes], None]
-"""Told how a rollout ended, with the content of its record's file."""
+"""Called when a rollout ends, with the content of its record's file."""
 
 
 def run_expert(units: Iterable[RolloutSpec], pool: SlotPool, slots: int, on_end: OnEnd) -> None:
@@ -112,7 +112,7 @@ def run_expert(units: Iterable[RolloutSpec], pool: SlotPool, slots: int, on_end:
         units: what to drive.
         pool: of slots with `collect_server.SERVER` and settings that name the expert.
         slots: how many.
-        on_end: told of each.
+        on_end: called with each.
     """
     queue = WorkQueue(WorkItem(u, u.trial) for u in units)
 
@@ -146,7 +146,7 @@ def run_policy(
         make_host: loads the policy.
         places: where, `an `EngineConfig` of `evaluation.launch``.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
-        on_end: told of each.
+        on_end: called with each.
 
     Raises:
         ScenarioError: the policy went away, so that some were not driven.

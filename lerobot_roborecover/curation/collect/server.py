@@ -50,8 +50,6 @@ class VideoJob:
 
 @dataclass(frozen=True)
 class RenderedRollout:
-    """Reply to `render`."""
-
     observations: list[Observation]
     """T raw observations, one before each action."""
     error_m: float

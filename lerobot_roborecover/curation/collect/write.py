@@ -76,7 +76,7 @@ def write_collection(
         dropped: decisions on all other rollouts.
         writing: how.
         about: content of `meta/roborecover/collect.json`.
-        on_rendered: told how many are written.
+        on_rendered: called with how many are written.
 
     Raises:
         ScenarioError: nothing could be written, or the folder is not new.

@@ -179,7 +179,7 @@ def _check_sizes(config: ChainConfig) -> None:
 
 
 def _frame_sizes(dataset: Path) -> set[tuple[int, int]]:
-    """Height and width of a dataset's videos, or `_NO_VIDEO`; nothing where that cannot be told."""
+    """Height and width of a dataset's videos, or `_NO_VIDEO`; nothing where that cannot be known."""
     try:
         features = json.loads((dataset / "meta" / "info.json").read_bytes())["features"].values()
         return {tuple(f["shape"][:2]) for f in features if f["dtype"] == "video"} or {_NO_VIDEO}

@@ -108,8 +108,6 @@ class AnnotatePart:
 
 @dataclass
 class PolicyPart:
-    """A screening policy."""
-
     path: str = ""
     name: str | None = None
     deterministic: bool = False

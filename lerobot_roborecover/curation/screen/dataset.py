@@ -17,9 +17,9 @@ from lerobot_roborecover.curation.screen.runs import (
 from lerobot_roborecover.curation.screen.screening import (
     Screened,
     ScreenRule,
+    count_outcomes,
     provenance_of,
     screen,
-    tally,
 )
 from lerobot_roborecover.curation.screen.tables import (
     format_histogram,
@@ -86,14 +86,13 @@ class ScreenRequest:
 
     @property
     def trials(self) -> Path:
-        """The trials' folder."""
         return self.trials_folder or self.out.with_name(f"{self.out.name}.trials")
 
     def check(self) -> None:
         """Checks what can be checked without scenarios, but for the rule, which `rule.check` does.
 
         Raises:
-            OptionError: policies cannot be told apart, or an option is not one for screening.
+            OptionError: policies cannot be distinguished, or an option is not one for screening.
         """
         self.workplace.check()
         check_policies(self.policies)
@@ -113,8 +112,6 @@ class ScreenRequest:
 
 @dataclass(frozen=True)
 class Screening:
-    """What a screening gave."""
-
     found: list[Screened]
     """Empty where only a shard's trials were run."""
     rows: Mapping[str, Sequence[TrialRow]]
@@ -129,7 +126,7 @@ def screen_dataset(
 
     Args:
         request: what and how.
-        progress: told of each finished trial: the policy's name, and how many are done of how many.
+        progress: called with each finished trial: the policy's name, and how many are done of how many.
 
     Raises:
         OptionError, ScenarioError: the request makes no sense, or no scenario stays.
@@ -196,7 +193,7 @@ def _trials(
 
     def undecided() -> list[Screened]:
         so_far = {name: list(of.values()) for name, of in rows.items()}
-        return [s for s in tally(scenarios, so_far, rule, request.deterministic) if not s.settled]
+        return [s for s in count_outcomes(scenarios, so_far, rule, request.deterministic) if not s.settled]
 
     for policy in sorted(
         request.policies, key=lambda p: rule.curtail and p.name not in request.deterministic

@@ -38,8 +38,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """A screening policy."""
-
     path: str
     """Folder or Hub id of the checkpoint."""
     name: str = ""
@@ -141,7 +139,7 @@ def _rename_map(texts: Sequence[str]) -> dict[str, str]:
 
 
 def check_policies(policies: Sequence[PolicySpec]) -> None:
-    """Checks that policies can be told apart.
+    """Checks that policies can be distinguished.
 
     Raises:
         OptionError: there is none, a name occurs twice, or two are the same.
@@ -199,7 +197,7 @@ def run_policy(
         device: of the policy.
         slots, max_batch, workplace, replicas: of `run_trials`.
         snapshots: folder of handoffs that other runs have left, where the options name none.
-        on_row: told of each finished trial, and how many are done of how many.
+        on_row: called with each finished trial, and how many are done of how many.
 
     Raises:
         OptionError: the folder holds trials of this name with other options.

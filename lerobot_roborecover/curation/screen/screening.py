@@ -125,12 +125,10 @@ class Screened:
 
     @property
     def successes(self) -> int:
-        """Of all policies."""
         return sum(c.successes * c.each_counts for c in self.counts.values())
 
     @property
     def trials(self) -> int:
-        """Of all policies."""
         return sum(c.trials * c.each_counts for c in self.counts.values())
 
     @property
@@ -223,7 +221,7 @@ def screen(
         ScenarioError: a scenario lacks a trial that its verdict needs, or two trials of a deterministic
             policy differ.
     """
-    found = tally(scenarios, rows, rule, deterministic)
+    found = count_outcomes(scenarios, rows, rule, deterministic)
     for one in found:
         if one.complete or (rule.curtail and one.settled):
             continue
@@ -237,7 +235,7 @@ def screen(
     return found
 
 
-def tally(
+def count_outcomes(
     scenarios: Sequence[Scenario],
     rows: Mapping[str, Sequence[TrialRow]],
     rule: ScreenRule,

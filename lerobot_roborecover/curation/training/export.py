@@ -6,7 +6,7 @@ as its log says is left out. Beside LeRobot's columns and ours (`datasets.trajec
     next.success, next.done            bool: the action solved the task; it is the episode's last
     next.reward                        float32: the step's share of the return (`returns`)
     complementary_info.is_intervention bool: the action was not chosen by the trial's policy
-    roborecover.progress               float32: of the task before the action; NaN where it is not told
+    roborecover.progress               float32: of the task before the action; NaN where it is not known
     roborecover.return_to_go, .value, .advantage   float32 (`returns`)
 
 `sarm_progress.parquet` is what LeRobot's RA-BC reads (`lerobot.rewards.sarm.rabc`): `progress_sparse` is the
@@ -71,10 +71,10 @@ def export_training(
         lines: the episodes, of one platform.
         simulator: its options, which decide the observations.
         workers: processes that replay.
-        dropped: told of episodes that do not replay.
+        dropped: called with episodes that do not replay.
         description: free text.
         license: SPDX identifier, or None where none is decided.
-        on_episode: told how many are done of how many.
+        on_episode: called with how many are done of how many.
         also: writes further files into the folder before it appears.
 
     Raises:

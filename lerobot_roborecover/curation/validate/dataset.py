@@ -52,8 +52,6 @@ _SCHEMA = 1
 
 @dataclass(frozen=True)
 class Validation:
-    """What a validation gave."""
-
     replays: Mapping[str, Replays]
     """By scenario id."""
     decisions: Sequence[Decision]

@@ -156,7 +156,7 @@ def _seen_from(scenario: Scenario, originals: Originals | None, rollout: Origina
 
 @dataclass(frozen=True)
 class _Refusing:
-    """A simulator, or a trail on it, whose refusal of an action says which one it was."""
+    """A simulator, or a history on it, whose refusal of an action says which one it was."""
 
     inner: Steppable
     what: Callable[[int], str]
@@ -222,9 +222,9 @@ def _replay_run(
         recorded[step] = scenario.fingerprint.bodies
     eef, objects, worst = _displacements(seen.bodies, recorded)
     state, solved = simulator.state_sha256(), simulator.succeeded()
-    trail = RollbackHistory(simulator, scenario.rollout, step, control_mode=run.control_mode)
+    history = RollbackHistory(simulator, scenario.rollout, step, control_mode=run.control_mode)
     ended = ("horizon", len(run.actions))
-    for number in _follow(trail, run.actions, lambda n: f"action {n} of {run.policy}, trial {run.trial}"):
+    for number in _follow(history, run.actions, lambda n: f"action {n} of {run.policy}, trial {run.trial}"):
         if number and simulator.succeeded():
             ended = ("success", number)
             break

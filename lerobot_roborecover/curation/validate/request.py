@@ -83,7 +83,6 @@ class ValidationRequest:
 
     @property
     def folder(self) -> Path:
-        """The working folder."""
         return self.work or self.out.with_name(f"{self.out.name}.replays")
 
     def sheet(self, scenario_id: str) -> Path:

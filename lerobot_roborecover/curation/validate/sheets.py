@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.analysis.pages.page import render_page
 from lerobot_roborecover.curation.funnel import Decision
 from lerobot_roborecover.curation.validate.validation import Replays, ValidationRule
 from lerobot_roborecover.scenario import Scenario
@@ -79,8 +80,6 @@ def write_page(
         rule: limits.
         command: how to reject one.
     """
-    import jinja2
-
     entries: list[dict[str, Any]] = [
         {
             "scenario": s,
@@ -90,10 +89,10 @@ def write_page(
         }
         for s in sorted(scenarios, key=lambda s: _badness(replays[s.id], decisions[s.id], s.id))
     ]
-    template = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True
-    ).get_template("page.html.j2")
-    text = template.render(entries=entries, rule=rule, command=command)
+    title = "Original, replay and difference"
+    text = render_page(
+        "replays.html.j2", title=title, with_files=True, entries=entries, rule=rule, command=command
+    )
     atomic_write(path, text)
 
 

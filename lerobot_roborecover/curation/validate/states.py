@@ -1,7 +1,7 @@
 """Writes state hashes into a scenario dataset that has none, whatever stage it is at.
 
 Sets that were validated before `validate` wrote the replayed state's hash lack it, and so do scenarios from
-elsewhere: their handoffs can be told to be within 2 mm, but not to be identical. Every prefix is replayed
+elsewhere: their handoffs can be known to be within 2 mm, but not to be identical. Every prefix is replayed
 twice, the second time by other processes and in the opposite order (`curation.exactness`).
 """
 

@@ -79,8 +79,6 @@ def draw_runs[R](scenario_id: str, runs: Sequence[R], rule: ValidationRule) -> l
 
 @dataclass(frozen=True)
 class RunReplay:
-    """One screening run, replayed."""
-
     policy: str
     trial: int
     eef_mm: float

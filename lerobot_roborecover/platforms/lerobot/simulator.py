@@ -69,7 +69,6 @@ class LeRobotSimulator:
 
     @property
     def action_dim(self) -> int:
-        """Values in an action."""
         return self._space.shape[0]
 
     def _vectors(self) -> gym.spaces.Box:
@@ -225,7 +224,6 @@ class LeRobotSimulator:
         return {name: _hash(array) for name, array in {**parts, "success": flags}.items()}
 
     def state_sha256(self) -> str:
-        """SHA-256 of `state_parts`."""
         return hashlib.sha256(json.dumps(self.state_parts()).encode()).hexdigest()
 
     def snapshot(self) -> bytes:

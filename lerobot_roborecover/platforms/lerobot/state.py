@@ -26,8 +26,6 @@ _FREE_JOINT = 0
 
 
 class EnvState(Protocol):
-    """One kind of state."""
-
     kind: str
     """In a few words, for people."""
 
@@ -85,7 +83,6 @@ class MujocoState:
         self._movable = mujoco_state.movable_bodies(model, exclude=robots)
 
     def parts(self) -> dict[str, np.ndarray]:
-        """The integration state."""
         return {"mujoco": self._mujoco.save_state(self._model, self._data)}
 
     def restore(self, parts: Mapping[str, np.ndarray]) -> None:
@@ -181,7 +178,7 @@ class PairState:
         return dict(_flat("state", self._inner.get_state()))
 
     def restore(self, parts: Mapping[str, np.ndarray]) -> None:
-        """Gives one array back; a structure cannot be told from its parts."""
+        """Gives one array back; a structure cannot be distinguished from its parts."""
         if set(parts) != {"state"}:
             raise SimulatorError("get_state() gives a structure, of which only the parts are kept: replay")
         self._inner.set_state(parts["state"].copy())

@@ -16,11 +16,11 @@ from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
 from lerobot_roborecover.platforms.env_options import (
     check_quality,
     chosen_quality,
+    drop_pictures,
     first_camera,
     no_video,
     refuse_unused,
 )
-from lerobot_roborecover.platforms.lerobot_features import drop_pictures
 from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 
 _ROBOT_STATE = "robot_state/"

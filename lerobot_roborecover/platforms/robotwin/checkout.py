@@ -94,7 +94,6 @@ class RobotwinCheckout:
         return sorted(p.stem for p in self.configs.glob("*.yml") if not p.stem.startswith("_"))
 
     def task_file(self, task: str) -> Path:
-        """Source file of a task."""
         return self.root / "envs" / f"{task}.py"
 
     def config(self, name: str) -> dict[str, Any]:

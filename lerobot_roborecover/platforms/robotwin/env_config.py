@@ -11,8 +11,7 @@ from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
-from lerobot_roborecover.platforms.env_options import first_camera, no_video, refuse_unused
-from lerobot_roborecover.platforms.lerobot_features import drop_pictures
+from lerobot_roborecover.platforms.env_options import drop_pictures, first_camera, no_video, refuse_unused
 from lerobot_roborecover.platforms.robotwin.processors import (
     MOSAIC,
     MOSAIC_SIZE,

@@ -16,13 +16,13 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.policy_settings import digest_of
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import run_with_arguments
+from lerobot_roborecover.policies.determinism import fit_threads
 from lerobot_roborecover.policies.load_problems import plain_loading
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
 from lerobot_roborecover.policies.remote.keys import API_KEY, api_key, check_key
 from lerobot_roborecover.policies.remote.served import ServedPolicy
 from lerobot_roborecover.policies.remote.server import PolicyServer, ServeOptions, is_loopback
-from lerobot_roborecover.policies.threads import fit_threads
 
 logger = logging.getLogger(__name__)
 

@@ -101,11 +101,11 @@ class Batcher:
     Args:
         policy: with `act`, `start` and `finish`.
         delay_s: how long a request waits for others to share its batch.
-        company: how many requests may come at most, now.
+        expected: returns how many requests may come at most, now.
     """
 
-    def __init__(self, policy: ServedPolicy, delay_s: float, company: Callable[[], int]):
-        self._policy, self._delay_s, self._company = policy, delay_s, company
+    def __init__(self, policy: ServedPolicy, delay_s: float, expected: Callable[[], int]):
+        self._policy, self._delay_s, self._expected = policy, delay_s, expected
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._waiting: list[_Question] = []
         self._arrived = asyncio.Event()
@@ -124,7 +124,7 @@ class Batcher:
         while True:
             await self._arrived.wait()
             until = time.monotonic() + self._delay_s
-            while len(self._waiting) < min(self._policy.max_batch, self._company()):
+            while len(self._waiting) < min(self._policy.max_batch, self._expected()):
                 self._arrived.clear()
                 try:
                     await asyncio.wait_for(self._arrived.wait(), until - time.monotonic())

@@ -133,6 +133,5 @@ class AcceptedSocket(socket.socket):
     number: int
 
     def close(self) -> None:
-        """Closes it; see `socket.socket.close`."""
         self.sockets.finished(self.number)
         super().close()

@@ -77,7 +77,6 @@ class LabRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether it answers."""
         return self._connected
 
     @property

@@ -130,7 +130,6 @@ class _OpenSimulator(MetaworldSimulator):
         return found
 
     def object_joints(self) -> Truth:
-        """Joint positions by object."""
         qpos = self._ready().data.qpos
         return {name: qpos[where].tolist() for name, where in self._addresses().items()}
 

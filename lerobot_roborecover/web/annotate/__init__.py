@@ -1,7 +1,7 @@
 """`roborecover curate annotate`: a local web page on which people mark recovery points, each alone and blind.
 
-queue.py     who sees what when; identity.py  what annotators call dataset and episodes
-sheet.py     what is told of an episode
+identity.py  what annotators call dataset and episodes, and in which order they see them
+sheet.py     what the page shows of an episode
 server.py    the answers; serve.py  the process
 page/        HTML, script and style
 """

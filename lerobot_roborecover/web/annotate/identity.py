@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,3 +70,17 @@ def _rollout_sha256(candidates: CandidateSet, episode: int) -> str:
 
 def _sha256(parts: list) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def queue_order(candidates: Iterable[str], annotator: str, seed: int) -> list[str]:
+    """Candidates in an annotator's order.
+
+    A candidate's place depends on its own id alone, so that candidates which come or go later leave the order
+    of the others as it was.
+
+    Args:
+        candidates: ids.
+        annotator: whose order.
+        seed: of the study.
+    """
+    return sorted(candidates, key=lambda c: hashlib.sha256(f"{seed}/{annotator}/{c}".encode()).digest())

@@ -13,8 +13,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.options import option
-from lerobot_roborecover.web.annotate.identity import names_of
-from lerobot_roborecover.web.annotate.queue import queue_order
+from lerobot_roborecover.web.annotate.identity import names_of, queue_order
 from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 
 DEFAULT_PORT = 8731

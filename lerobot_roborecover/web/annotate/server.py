@@ -2,7 +2,7 @@
 
 Each annotator has a token and an address of their own, `/NAME/`. The first request carries the token in its
 query and gets it as a cookie for that address; every further request, pictures included, must carry the
-cookie (`studio/web/guard.py`). Episodes go by names that tell nothing (`identity.py`), and a vote says which
+cookie (`web/guard.py`). Episodes go by names that tell nothing (`identity.py`), and a vote says which
 dataset it is about: one of another is refused, never recorded.
 
 Starlette and uvicorn rather than `http.server`: header, cookie and body parsing are what a server gets wrong,

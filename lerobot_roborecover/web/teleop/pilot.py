@@ -63,8 +63,6 @@ class Tick:
 
 @dataclass(frozen=True)
 class HeldInput:
-    """Held input of one device."""
-
     axes: tuple[float, ...] = (0.0,) * len(AXES)
     wait: bool = False
     """Let time pass without moving."""

@@ -83,7 +83,6 @@ def plain_text(sent: dict[str, Any], name: str) -> str:
 
 
 def picture(camera: int, step: int, jpeg: bytes) -> bytes:
-    """A picture as it is sent."""
     return _HEADER.pack(camera, step) + jpeg
 
 

@@ -111,15 +111,7 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
                 simulation.join()
         finally:
             listener.close()
-        write_dataset(
-            config.dataset,
-            store,
-            config.platform,
-            dict(config.options),
-            config.size,
-            say,
-            config.frame_stride,
-        )
+        _write(config, store, say)
     finally:
         store.close()
 
@@ -133,17 +125,15 @@ def write(config: TeleopConfig, say: Callable[[str], None]) -> None:
     store = Store(recordings_folder(config.dataset))
     try:
         _check_platform(store, config.platform)
-        write_dataset(
-            config.dataset,
-            store,
-            config.platform,
-            dict(config.options),
-            config.size,
-            say,
-            config.frame_stride,
-        )
+        _write(config, store, say)
     finally:
         store.close()
+
+
+def _write(config: TeleopConfig, store: Store, say: Callable[[str], None]) -> None:
+    write_dataset(
+        config.dataset, store, config.platform, dict(config.options), config.size, say, config.frame_stride
+    )
 
 
 def view_options(platform: str, size: int | None) -> dict[str, Any]:

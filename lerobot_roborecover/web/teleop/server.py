@@ -1,6 +1,6 @@
 """The page's server: files, and one websocket that carries inputs one way, status and pictures the other.
 
-Requests are checked as those of `annotate` are (`studio/web/guard.py`); a websocket from another page is
+Requests are checked as those of `annotate` are (`web/guard.py`); a websocket from another page is
 refused by its Origin. Whatever a message holds, the answer is a line that says what is wrong.
 """
 
@@ -32,8 +32,6 @@ _PAGE = PageFiles("lerobot_roborecover.web.teleop", "app.js", "inputs.js", "link
 
 @dataclass(frozen=True)
 class TeleopApp:
-    """What is served."""
-
     token: str
     hosts: frozenset[str]
     hub: Hub

@@ -1,7 +1,7 @@
 """One trajectory while it is driven: every action exactly as executed, every state seen, steps taken back
 exactly.
 
-Taking steps back is the rollback of the interventions (`rewind.py`): a snapshot is restored where
+Taking steps back is the rollback of the interventions (`replay/rollback.py`): a snapshot is restored where
 snapshots are exact, otherwise task and actions are replayed, and the state's hash must be the one that was.
 What is left is therefore a trajectory that never had those steps.
 """
@@ -53,14 +53,14 @@ class TeleopSession:
         self.controls = platform_named(simulator.platform).controls()
         self.start_point: StartPoint | None = None
         self.mark: Mark | None = None
-        self._trail: RollbackHistory | None = None
+        self._history: RollbackHistory | None = None
         self._recorder = Recorder(simulator)
         self._clear()
 
     def _clear(self) -> None:
         self._recorder.clear()
         self.devices: Counter[str] = Counter()
-        self.rewinds = self.undone = 0
+        self.rollbacks = self.undone = 0
         self.mark = None
 
     # --- driving
@@ -76,14 +76,14 @@ class TeleopSession:
             ScenarioError: the task cannot be reset so.
             SimulatorError: likewise.
         """
-        self.start_point = self._trail = None
+        self.start_point = self._history = None
         self._clear()
         self._recorder.reset(start.task, start.reset)
         # What LIBERO draws at random becomes a part of the reset.
         start = replace(start, reset=self._recorder.reset_record)
         for step in follow(self._recorder, start.prefix):
             told(step, len(start.prefix))
-        self._trail = RollbackHistory(
+        self._history = RollbackHistory(
             self.simulator,
             start.rollout,
             len(start.prefix),
@@ -123,27 +123,27 @@ class TeleopSession:
             ScenarioError: nothing was started, or the recording is as long as a prefix may be.
             SimulatorError: the simulator cannot go on.
         """
-        trail = self._require()
+        history = self._require()
         if self.step >= MAX_PREFIX_STEPS:
             raise ScenarioError(f"a recording has at most {MAX_PREFIX_STEPS} steps; save or discard it")
-        trail.step(action)
+        history.step(action)
         self._recorder.note(action)
         self.devices[device] += 1
 
-    def back(self, steps: int) -> int:
+    def roll_back(self, steps: int) -> int:
         """Takes steps back, at most to where the person began; a mark after that goes too.
 
         Returns:
             How many.
         """
-        trail = self._require()
+        history = self._require()
         count = min(steps, self.step - len(self._start.prefix))
         if count <= 0:
             return 0
-        trail.back(count)
+        history.roll_back(count)
         target = self.step - count
         self._recorder.cut(target)
-        self.rewinds, self.undone = self.rewinds + 1, self.undone + count
+        self.rollbacks, self.undone = self.rollbacks + 1, self.undone + count
         if self.mark is not None and self.mark.step > target:
             self.mark = None
         return count
@@ -209,7 +209,7 @@ class TeleopSession:
         rollout, steps = self._recorder.rollout, self._recorder.steps
         notes: dict[str, Any] = {
             "devices": dict(self.devices),
-            "rewinds": self.rewinds,
+            "rewinds": self.rollbacks,
             "steps_undone": self.undone,
             "driven_from": len(start.prefix),
             "recorded_at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -240,9 +240,9 @@ class TeleopSession:
         return self.start_point
 
     def _require(self) -> RollbackHistory:
-        if self._trail is None:
+        if self._history is None:
             raise ScenarioError("nothing is under way; start a task first")
-        return self._trail
+        return self._history
 
 
 def _check_labels(stage: str, deviation: str) -> None:

@@ -186,7 +186,7 @@ class SimulatorThread(threading.Thread):
             time.sleep(0.02)  # the server's thread says it before a compiler takes the interpreter
 
         self._at, self._previewing = number, False
-        self._session.start_point = self._session._trail = None
+        self._session.start_point = self._session._history = None
         try:
             told(0, len(start.prefix))
             self._session.start(start, told)
@@ -210,7 +210,7 @@ class SimulatorThread(threading.Thread):
         if not isinstance(err, ScenarioError):
             _LOG.exception("the simulator broke")
             # Its state is unknown: nothing of it may be saved.
-            self._session.start_point = self._session._trail = self._at = None
+            self._session.start_point = self._session._history = self._at = None
             self._previewing = False
         self._broken = str(err) or type(err).__name__
         return self._broken
@@ -297,7 +297,7 @@ class SimulatorThread(threading.Thread):
 
     def _do_back(self, sent: dict[str, Any]) -> dict[str, Any]:
         self.pilot.let_go()
-        taken = self._session.back(whole_number(sent, "steps", 1, MAX_BACK))
+        taken = self._session.roll_back(whole_number(sent, "steps", 1, MAX_BACK))
         start = self._session.start_point
         if start is not None and self._session.actions:
             self.pilot.closed = self._session.controls.closed_by(self._session.actions[-1])
@@ -347,7 +347,7 @@ class SimulatorThread(threading.Thread):
 
     def _end(self) -> None:
         """Nothing is under way any more; a start that was discarded comes next once more."""
-        self._session.start_point = self._session._trail = None
+        self._session.start_point = self._session._history = None
         self._at, self._previewing = None, False
         self.pilot.let_go()
 

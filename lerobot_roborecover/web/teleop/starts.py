@@ -18,8 +18,6 @@ MAX_STARTS = 100_000
 
 @dataclass(frozen=True)
 class StartPoint:
-    """One start."""
-
     task: Task
     reset: Reset
     prefix: np.ndarray

@@ -37,8 +37,6 @@ _STATE, _IMAGES = "observation.state", "observation.image"
 
 @dataclass
 class TakeoverSlot:
-    """One takeover."""
-
     instruction: str
     controls: Controls | None = None
     step: int = 0
@@ -110,7 +108,6 @@ class Takeover:
                 return None
 
     def leave(self, slot: TakeoverSlot) -> None:
-        """See `TakeoverController.leave`."""
         self._slot = None
         self._pilot.let_go()
         self._publish()

@@ -78,7 +78,7 @@ def write_dataset(
         platform: their simulator.
         options: of the simulator, beside its pictures.
         size: rows and columns of the pictures; None for the platform's own, 0 for none.
-        say: told the progress.
+        say: called with the progress.
         frame_stride: steps from one picture to the next; the last one stands until then.
 
     Returns:
