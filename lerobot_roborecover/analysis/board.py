@@ -40,7 +40,7 @@ class Provenance:
     execution_horizon: int | None
     options: dict[str, Any]
     config_hashes: tuple[str, ...]
-    """Of the settings, one a start."""
+    """Config hashes of the settings, one a start."""
     finished_at: str
     """Last trial, UTC."""
 

@@ -26,7 +26,7 @@ class HubResult:
     value: float
     """Per cent."""
     revision: str | None
-    """Of the scenario set."""
+    """Revision of the scenario set."""
     pull_request: int | None
     """Number, where it is offered and not merged."""
     notes: str

@@ -41,7 +41,7 @@ class Leaderboard:
     refused: tuple[tuple[str, str], ...]
     """File name and reason."""
     trials: tuple[BoardTrials, ...] = ()
-    """Of each board."""
+    """Trials of each board."""
 
 
 def make_leaderboard(

@@ -58,7 +58,7 @@ class StartSummary:
     scenarios: int
     trials: int
     rsr: Estimate
-    """Of initial-state trials: first states weigh the same, and are the units of the interval."""
+    """RSR of initial-state trials: first states weigh the same, and are the units of the interval."""
     macro: Estimate
     """Over the cells that are large enough; undefined where none is."""
     macro9: Estimate
@@ -73,7 +73,7 @@ class StartSummary:
     cells: tuple[CellSummary, ...]
     """Occupied cells, in the order of the paper's stages and types."""
     first_states: int
-    """Of the scenarios."""
+    """First states of the scenarios."""
     within: Mapping[int, Estimate]
     """RSR@k by k from 2, as far as every scenario has k trials; empty of initial-state trials."""
 

@@ -24,14 +24,14 @@ class CheckPlatformOptions:
     steps: int = STEPS
     """Random actions of a run."""
     seed: int = 0
-    """Of the actions."""
+    """Seed of the actions."""
     simulator: dict[str, Any] = option(
         factory=dict,
         name="options",
         metavar="JSON",
         parse=json_object("--options", "the simulator's options"),
     )
-    """Of the simulator, e.g. '{"obs_type": "state"}'."""
+    """Options of the simulator, e.g. '{"obs_type": "state"}'."""
     as_json: bool = option(False, name="json")
     """Print the checks as one JSON object."""
 

@@ -43,9 +43,9 @@ class DonorDataOptions:
     """Folder of the donors' trials, kept between runs (OUT.trials)."""
     rule: DonorOptions = field(default_factory=DonorOptions)
     run_seed: int = 2000
-    """Of the donors' trials."""
+    """Run seed of the donors' trials."""
     device: str | None = None
-    """Of the donors."""
+    """Device of the donors."""
     num_workers: int = option(1, old=("workers",))
     """Processes that replay and render."""
     statistics_of: str | None = option(None, metavar="CHECKPOINT")

@@ -19,7 +19,7 @@ class InspectOptions:
     dataset: str = option(positional=True)
     """Folder, shipped name or Hub id."""
     revision: str | None = None
-    """Of a Hub dataset: tag, branch or commit."""
+    """Revision of a Hub dataset: tag, branch or commit."""
     split: str | None = None
     """This split only."""
     select: str = ""

@@ -26,7 +26,7 @@ class PlanOptions:
     """Standard deviation of a policy's true rates between scenarios (default: the pilot's, else that of a
     third of the greatest variance)."""
     correlation: float | None = None
-    """Of the two policies' true rates over scenarios (default: the pilot's, else 0.5)."""
+    """Correlation of the two policies' true rates over scenarios (default: the pilot's, else 0.5)."""
     difference: tuple[float, ...] | None = option(None, nargs="+", metavar="POINTS")
     """True differences to plan for (default: 5 10 15 20, as far as the rate leaves room)."""
     trials: tuple[int, ...] = option((1, 2, 3, 4, 5), nargs="+", metavar="K")

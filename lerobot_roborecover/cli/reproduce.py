@@ -20,17 +20,17 @@ class ReproduceOptions:
     """What to reproduce, and on which scenarios."""
 
     name: str | None = option(None, positional=True)
-    """Of policies/eval, or a configuration file; without: what there is."""
+    """Name in policies/eval, or a configuration file; without it, the names are printed."""
     out: Path | None = None
     """Folder of the results; a rerun goes on there (default: outputs/NAME)."""
     scenarios: str | None = option(None, metavar="SET")
     """Folder, Hub id or shipped set (default: the configuration's)."""
     split: str | None = option(None, metavar="SPLIT")
-    """Of the scenarios, e.g. test."""
+    """Split of the scenarios, e.g. test."""
     select: str | None = option(None, metavar="EXPR")
     """Of the scenarios, as --env.select."""
     trials: int = 5
-    """Of each scenario in each arm."""
+    """Trials of each scenario in each arm."""
     published: str | None = option(None, metavar="RATE")
     """What to hold the initial arm against, in per cent: RATE or RATE,LOW,HIGH (default: the paper's)."""
     margin: float = option(10.0, metavar="POINTS")

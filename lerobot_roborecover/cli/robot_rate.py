@@ -17,13 +17,13 @@ class RobotRateOptions:
     run: Path = option(positional=True, metavar="RUN")
     """Folder of a run of `roborecover robot run`."""
     rater: str = ""
-    """Who rates; a pseudonym. Without one, the agreement so far is printed."""
+    """Pseudonym of the rater. Without one, the agreement so far is printed."""
     host: str = "127.0.0.1"
     """Where the page is served; 0.0.0.0 lets a phone on the same network in."""
     port: int = 8734
     """0 takes a free port."""
     seed: int = 0
-    """Of the order in which trials are shown."""
+    """Seed of the order in which trials are shown."""
 
 
 OPTIONS = RobotRateOptions

@@ -26,7 +26,7 @@ class SplitOptions:
     others: tuple[str, ...] = option((), name="split", metavar="NAME=SIZE")
     """A split of another name; repeat it for several."""
     seed: int = SplitConfig.seed
-    """Of the draw."""
+    """Seed of the draw."""
     disjoint_by: tuple[str, ...] | None = option(None, metavar="KEYS", old=("apart",), parse=parse_apart)
     """What no two splits may share, of trajectory, record, instruction, start, separated by commas
     (trajectory,record; on robotwin also instruction)."""

@@ -21,9 +21,9 @@ class TeleopOptions(TeleopConfig):
     suite: str = ""
     """Where several suites have a task of that name."""
     seeds: str | None = option(None, metavar="LIST")
-    """Of the starts, e.g. 0-9,12 (0; on LIBERO 7)."""
+    """Seeds of the starts, e.g. 0-9,12 (0; on LIBERO 7)."""
     init_states: str | None = option(None, metavar="LIST")
-    """Of the starts, on LIBERO (0)."""
+    """Init states of the starts, on LIBERO (0)."""
     continued: Sequence[tuple[str, str, str]] = option((), name="continue", metavar=("DATASET", "ID", "STEP"))
     """Start some steps into a candidate's rollout; repeat it for several."""
     assets_dir: str | None = None

@@ -122,9 +122,9 @@ class CandidateSet:
     root: Path
     trajectories: TrajectorySet
     candidates: tuple[Candidate, ...]
-    """By episode."""
+    """Candidates by episode."""
     versions: Mapping[str, str]
-    """Of the simulator that recorded, as `Simulator.fingerprint` names them."""
+    """Versions of the simulator that recorded, as `Simulator.fingerprint` names them."""
 
     def __len__(self) -> int:
         return len(self.candidates)

@@ -41,9 +41,9 @@ class DonorOptions:
     donor_above: float = option(0.6, name="min-donor-rate", old=("donor-above",))
     """An alternative recovers it more often."""
     trials: int = 4
-    """Of each candidate."""
+    """Trials of each candidate."""
     successes: int = 3
-    """Of these, at least."""
+    """Successes of these, at least."""
     per_record: int = 1
     """Trajectories per source record.
 
@@ -78,7 +78,7 @@ class DonorCandidate:
     """As in the trial logs."""
     base_rate: float
     donor_rate: float
-    """Of the selection's trials."""
+    """Donor rate of the selection's trials."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class People:
     """Personal data in a dataset. Annotating programs are not people."""
 
     names: tuple[str, ...] = ()
-    """Of annotators and of who rejected scenarios on inspection, in an order that tells nothing."""
+    """Names of annotators and of inspectors who rejected scenarios, in an order that tells nothing."""
     votes: int = 0
     """In these files and in scenarios' provenance."""
     times: int = 0
@@ -50,7 +50,7 @@ class People:
     seconds: int = 0
     """Votes with the time that was spent."""
     comments: int = 0
-    """Of votes, and reasons given on inspection."""
+    """Comments of votes, and reasons given on inspection."""
     decisions: int = 0
     """That name a person."""
     operators: tuple[str, ...] = ()

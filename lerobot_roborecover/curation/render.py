@@ -96,7 +96,7 @@ def render(request: RenderRequest, progress: Callable[[int, int], None] = lambda
 
 
 def describe(request: RenderRequest, episodes: int) -> str:
-    """What came of rendering, and the command that follows.
+    """Returns the result of rendering as text, and the command that follows.
 
     Args:
         request: what was asked for.

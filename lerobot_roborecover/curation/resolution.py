@@ -84,7 +84,7 @@ class Resolution:
     """What the votes on a dataset amount to."""
 
     candidates: tuple[Resolved, ...]
-    """Of those that the stages before kept, in the order of the dataset."""
+    """Candidates of those that the stages before kept, in the order of the dataset."""
     agreement: tuple[Agreement, ...]
     """Before resolution, over blind votes of the first round."""
     annotators: tuple[str, ...]

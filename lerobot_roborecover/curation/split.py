@@ -45,7 +45,7 @@ class SplitConfig:
     """By split: a number of scenarios, or a fraction below 1; all of one kind. Counts are met exactly,
     fractions as closely as the groups allow."""
     seed: int = 42
-    """Of the draw."""
+    """Seed of the draw."""
     apart: tuple[str, ...] | None = option(None, name="disjoint-by", parse=_apart)
     """What no two splits may share, of `APART`; None takes what fits the platform."""
     least: Mapping[str, Mapping[str, int]] = internal(factory=dict)

@@ -43,12 +43,12 @@ class SplitReport:
     """Scenarios by split."""
     apart: tuple[str, ...]
     groups: int
-    """Of scenarios that stay together; a scenario on its own is one."""
+    """Groups of scenarios that stay together; a scenario on its own is one."""
     largest_group: int
     leaks: Mapping[str, Sequence[tuple[str, tuple[str, ...]]]]
-    """By key: what is shared across splits, and the ids that share it. Empty where nothing is."""
+    """Leaks by key: what is shared across splits, and the ids that share it. Empty where nothing is."""
     balance: Mapping[str, Mapping[str, Mapping[str, int]]]
-    """By axis and value: scenarios by split."""
+    """Balance by axis and value: scenarios by split."""
 
 
 def split_dataset(
@@ -176,7 +176,7 @@ def format_report(report: SplitReport) -> str:
 
 
 def describe(report: SplitReport, root: Path) -> str:
-    """What came of a division: the report, the funnel where there is one, and the command that follows.
+    """Returns the result as text: the report, the funnel where there is one, and the command that follows.
 
     Args:
         report: of `split_dataset`.

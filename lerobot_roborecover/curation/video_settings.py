@@ -19,7 +19,7 @@ class VideoSettings:
     every: int = 1
     """Steps from one picture to the next; the last one stands until then."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the simulator that rendered."""
+    """Options of the simulator that rendered."""
 
     def note(self) -> dict[str, Any]:
         """For the provenance, under `film`."""

@@ -49,7 +49,7 @@ class PublishConfig:
     license: str | None = option(None, parse=license_argument)
     """Licence by the Hub's identifier, e.g. cc-by-4.0; by default the one in the dataset's manifest."""
     version: str = "1.0.0"
-    """Of the dataset; tag roborecover-VERSION."""
+    """Version of the dataset; tag roborecover-VERSION."""
     private: bool = False
     """Make a new repository private.
 
@@ -58,7 +58,7 @@ class PublishConfig:
     force: bool = False
     """Move the tag of a version that is published already."""
     title: str = ""
-    """Of the card (default: the repository's name)."""
+    """Title of the card (default: the repository's name)."""
     pictures: bool = True
     """No grid of recovery frames in the card.
 

@@ -44,7 +44,7 @@ class Repaired:
     lines: tuple[str, ...]
     changed: bool
     ids: tuple[str, ...] = ()
-    """Of the scenarios, by episode; empty for trajectories."""
+    """Ids of the scenarios, by episode; empty for trajectories."""
 
 
 def repair(

@@ -87,7 +87,7 @@ class TrajectorySet:
     platform: str
     scenarios: tuple[ScenarioLink, ...]
     rows: tuple[TrajectoryRow, ...]
-    """By episode."""
+    """Rows by episode."""
     manifest: Mapping[str, Any]
 
     def episodes(self, split: str) -> list[int]:

@@ -28,7 +28,7 @@ class ForkedTrial:
     """One trial, continued from several of its steps."""
 
     row: TrialRow
-    """Of its last continuation, which up to the last fork is the trial itself."""
+    """Row of its last continuation, which up to the last fork is the trial itself."""
     gains: Mapping[int, float]
     """By step from the handoff: success with an intervention, less success when the policy goes on; the mean
     over random streams."""

@@ -43,7 +43,7 @@ class DetectionRequest:
     on_training_scenarios: bool = False
     """Compare also on scenarios that a monitor was trained on: says nothing about others."""
     seed: int = 0
-    """Of the scenarios' halves in the frame strips."""
+    """Seed of the scenarios' halves in the frame strips."""
     level: float = 0.95
     """Confidence level."""
 

@@ -54,7 +54,7 @@ class Detection:
     dropped: Counter
     remarks: list[str]
     pairs: list[Contrast]
-    """Of detectors, but for the oracle, which reads outcomes."""
+    """Pairs of detectors, but for the oracle, which reads outcomes."""
 
 
 @dataclass

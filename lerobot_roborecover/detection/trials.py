@@ -49,9 +49,9 @@ class TrialSource:
     env: Sequence[str] = option((), metavar="NAME=VALUE")
     """Option of the recovery env type, e.g. obs_type=state; may be given again."""
     trials: int = 1
-    """Of each scenario, from each start."""
+    """Trials of each scenario, from each start."""
     run_seed: int = 1000
-    """Of the trials."""
+    """Run seed of the trials."""
     device: str | None = None
     """Where the policy and the detectors run."""
     workers: int = option(1, name="num-workers", old=("workers",))

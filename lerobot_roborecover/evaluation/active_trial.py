@@ -30,9 +30,9 @@ class ActiveTrial:
     worker: WorkerState
     unit: WorkItem[TrialStart]
     trial: Trial
-    """Of `unit`."""
+    """Trial of `unit`."""
     replica: Replica | None
-    """Who has the trial's history; None once that is lost."""
+    """The replica that has the trial's history; None once that is lost."""
     history: Any
     waiting_since: float = 0.0
     answered_at: float | None = None

@@ -55,7 +55,7 @@ class EvaluationCallback:
     starts: Sequence[str] = ("recovery",)
     """Where the policy takes over; `("recovery", "initial")` says what a failure to recover is a part of."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of `evaluate`: `env`, `trials`, `seed`, `slots`, ..."""
+    """Options of `evaluate`: `env`, `trials`, `seed`, `slots`, ..."""
 
     def __post_init__(self) -> None:
         if self.every < 1:

@@ -29,7 +29,7 @@ class _Monitor:
     """The last one; of the trigger, once there is one."""
     highest: float = float("nan")
     step: int | None = None
-    """Of the trigger."""
+    """Step of the trigger."""
 
 
 @dataclass

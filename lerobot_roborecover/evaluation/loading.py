@@ -38,7 +38,7 @@ class HostSpec:
     rename_map: Mapping[str, str] = field(default_factory=dict)
     """The env's observation keys to the policy's, as `--rename_map` of `lerobot-eval`."""
     seed: int | None = 1000
-    """Of the run."""
+    """Seed of the run."""
     max_batch: int = 64
     """Observations per inference, at most."""
     cross_cpu_deterministic: bool = False

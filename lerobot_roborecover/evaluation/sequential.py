@@ -39,7 +39,7 @@ class Reference:
     path: Path
     sha256: str
     rates: Mapping[str, float]
-    """By scenario, invalid trials as failures."""
+    """Rates by scenario, invalid trials as failures."""
     trials: tuple[int, ...]
     """How many a scenario has; each number that occurs."""
 

@@ -66,7 +66,7 @@ class EvalSession:
     """Upright frame (H, W, 3) uint8 of an unbatched observation, for LeRobot's videos; None asks the
     simulator."""
     intervention: InterventionFacts | None = None
-    """Of a composite policy."""
+    """Intervention of a composite policy."""
     real_time: RealTime | None = None
     """None where the simulator waits for the policy."""
     policy_watchdog_s: float = POLICY_WATCHDOG_S

@@ -98,7 +98,7 @@ class RobotTrial:
     order: int = 0
     """Place of the trial in the run, from 0."""
     episode: int | None = None
-    """Of the rollout dataset; None where nothing was recorded."""
+    """Episode of the rollout dataset; None where nothing was recorded."""
     note: str = ""
     clock_jump_s: float = 0.0
     """How far the wall clock moved against the monotonic clock during the trial."""

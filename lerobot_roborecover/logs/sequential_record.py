@@ -26,10 +26,10 @@ class SequentialRecord:
     policy: str
     """As its rows say."""
     config_hash: str
-    """Of its rows."""
+    """Config hash of its rows."""
     start: str
     trials: int
-    """Of every scenario."""
+    """Trials of every scenario."""
     scenarios: tuple[str, ...]
     """Ids of all that belonged to the run, in the order in which they were run and count."""
     level: float

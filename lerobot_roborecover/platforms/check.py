@@ -46,11 +46,11 @@ class CheckRequest:
     tasks: tuple[Task, ...]
     """Each is checked; the others come in between."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the simulator."""
+    """Options of the simulator."""
     steps: int = STEPS
     """Random actions of a run."""
     seed: int = 0
-    """Of the actions."""
+    """Seed of the actions."""
 
     def __post_init__(self):
         check_seed(self.seed)

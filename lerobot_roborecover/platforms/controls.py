@@ -28,7 +28,7 @@ class Controls:
     width: int
     """Values in an action."""
     columns: Mapping[str, tuple[int, float]]
-    """By axis: the action's column, and the sign of the axis there."""
+    """Columns by axis: the action's column, and the sign of the axis there."""
     gripper: tuple[int, float, float] | None = None
     """The action's column, and its value to open and to close."""
     captions: Mapping[str, str] = field(default_factory=dict)

@@ -72,9 +72,9 @@ class Starts:
     draw: int = option(0, metavar="N", text="")
     """Draw N starts of each task instead."""
     seed: int = RELEASE_SEED
-    """Of every draw: starts, noise, perturbation."""
+    """Seed of every draw: starts, noise, perturbation."""
     reset_seed: int = RELEASE_SEED
-    """Of LIBERO's resets ({default}, the paper's).
+    """Reset seed of LIBERO's resets ({default}, the paper's).
 
     Of resets from stored init states: decides what the init state leaves to chance.
     """

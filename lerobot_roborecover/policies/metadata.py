@@ -22,7 +22,7 @@ class PolicyMetadata:
     """Policy metadata of a run; None where not given."""
 
     policy: str = "unknown"
-    """Who is evaluated, in the rows' words."""
+    """Name of the policy in trial rows."""
     policy_type: str | None = None
     """LeRobot's name of its kind."""
     n_episodes: int | None = None
@@ -35,7 +35,7 @@ class PolicyMetadata:
     """Actions executed per inference."""
     output_dir: Path | None = None
     intervention: InterventionFacts | None = None
-    """Of a composite policy."""
+    """Intervention of a composite policy."""
     policy_settings: Mapping[str, Any] = field(default_factory=dict)
     """See `TrialRow.policy_settings`."""
 

@@ -65,7 +65,7 @@ class Act:
     actions: np.ndarray
     """(n, A)."""
     mark: InterventionMark | None = None
-    """Of the first action; its controller chose them all. None where the policy does not intervene."""
+    """Mark of the first action; its controller chose them all. None where the policy does not intervene."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ _SET = ("scenarios", "revision", "split", "select")
 
 @dataclass(frozen=True)
 class ReproductionPlan:
-    """Who is reproduced, on what, and how often."""
+    """Which checkpoint is reproduced, on which scenarios, and how often."""
 
     checkpoint: PublishedCheckpoint
     out: Path
@@ -146,7 +146,7 @@ class ArmResult:
     rows: tuple[TrialRow, ...]
     summary: StartSummary
     seconds: float
-    """Of wall time, over all its runs."""
+    """Seconds of wall time, over all its runs."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class RunLength:
 
     trials: int
     steps: int
-    """Of policies, all trials together."""
+    """Steps of policies, all trials together."""
     looks: int
     """Observations that a policy gets."""
     simulator_h: float

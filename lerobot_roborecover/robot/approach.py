@@ -24,7 +24,7 @@ class MotionConfig:
     """How fast and how far joints may move, in the robot's units (degrees on an SO-101)."""
 
     speed: float = 15.0
-    """Of the fastest joint, units a second."""
+    """Speed of the fastest joint, units a second."""
     max_detour: float = 10.0
     """Farthest that a joint may be from the recorded approach before a person is asked whether the straight
     way there is free."""

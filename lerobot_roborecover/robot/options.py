@@ -25,7 +25,7 @@ class RobotPointsOptions:
     quasi_static: bool = False
     """You have looked: at these moments nothing is falling, sliding, or held by friction alone."""
     time_limit: float = option(30.0, metavar="SECONDS")
-    """Of a trial."""
+    """Time limit of a trial."""
     source_policy: str = ""
     """Who drove the robot in the episodes."""
     annotators: tuple[str, ...] = option((), name="annotator", metavar="NAME")
@@ -33,6 +33,6 @@ class RobotPointsOptions:
     votes_needed: int | None = option(None, metavar="N")
     """Makes the points from so many annotators' votes: majority of stage and type, median frame."""
     port: int = 8731
-    """Of the annotation page; 0 takes a free one."""
+    """Port of the annotation page; 0 takes a free one."""
     calibration: Path | None = option(None, metavar="FILE")
     """LeRobot's calibration file of the robot, for a dataset that this package did not record."""

@@ -44,7 +44,7 @@ class PlannedPolicy:
     path: str
     """Checkpoint folder or Hub id."""
     overrides: tuple[str, ...] = ()
-    """Of its configuration, e.g. `--n_action_steps=10`."""
+    """Overrides of its configuration, e.g. `--n_action_steps=10`."""
     rename_map: Mapping[str, str] = field(default_factory=dict)
     """The robot's observation keys to the policy's."""
 
@@ -56,7 +56,7 @@ class Plan:
     points: str
     """Folder of the recovery points."""
     policies: Mapping[str, PlannedPolicy]
-    """By the name that a report shows."""
+    """Policies by the name that a report shows."""
     repeats: int = 1
     """Trials of each policy on each point: so many blocks."""
     seed: int = 0
@@ -86,9 +86,9 @@ class LockedPlan:
 
     plan: Plan
     sha256: str
-    """Of the plan, the points and the policies' files."""
+    """Sha256 of the plan, the points and the policies' files."""
     identities: Mapping[str, str]
-    """By policy's name: what trial rows call it."""
+    """Identities by policy's name: what trial rows call it."""
     codes: Mapping[str, str]
     trials: tuple[PlannedTrial, ...]
 

@@ -45,7 +45,7 @@ class RobotPoint:
     joints: Mapping[str, float]
     """Position by feature name, e.g. `shoulder_pan.pos`, in the robot's units."""
     units: Mapping[str, str]
-    """By joint: `deg`, `percent`, `m`, or empty where it is not known."""
+    """Units by joint: `deg`, `percent`, `m`, or empty where it is not known."""
     pictures: Mapping[str, str]
     """SHA-256 of the recorded pixels by camera name."""
     fps: float

@@ -34,11 +34,11 @@ class RunConfig:
     """How a plan is run."""
 
     folder: Path
-    """Of the run: lock, journal, trial log, rollout dataset."""
+    """Folder of the run: lock, journal, trial log, rollout dataset."""
     rater: str
     """Who gives the verdicts; a pseudonym."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Of joints, narrower than the calibrated ones."""
+    """Limits of joints, narrower than the calibrated ones."""
     inference: Any = None
     """LeRobot `InferenceEngineConfig`; None is synchronous."""
     stop_after: int = 0

@@ -44,7 +44,7 @@ class Backend:
     address: str = option("auto", name="ray-address", metavar="ADDRESS")
     """The cluster's (this machine's)."""
     prefix: str = internal("--")
-    """Of its options' names, for messages."""
+    """Prefix of its options' names, for messages."""
     count: str = internal("num_workers")
     """The option that says how many there are."""
     device: str = internal("--device")

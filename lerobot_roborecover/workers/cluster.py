@@ -50,9 +50,9 @@ class _NodeFacts:
     where: str
     """Its address."""
     versions: Mapping[str, str]
-    """Of what decides results there."""
+    """Versions of what decides results there."""
     failure: SlotFailure | None
-    """Of the first command."""
+    """Failure of the first command."""
 
 
 def result_of(reference: Any) -> Any:

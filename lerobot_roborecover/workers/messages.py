@@ -97,7 +97,7 @@ class EpisodeStart:
     hz: float = 0.0
     """Control steps per simulated second."""
     progress: float | None = None
-    """Of the task, from 0 to 1; None where the simulator does not tell."""
+    """Progress of the task, from 0 to 1; None where the simulator does not tell."""
 
 
 @dataclass(frozen=True)

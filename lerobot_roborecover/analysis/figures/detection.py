@@ -38,7 +38,7 @@ class FrameStrip:
     trial: int
     """Its number among the trials."""
     steps: tuple[int, ...]
-    """Of the pictures, replayed ones counted."""
+    """Steps of the pictures, replayed ones counted."""
     pictures: tuple[np.ndarray, ...]
     """(H, W, 3) uint8, one a step; none where they could not be rendered."""
 

@@ -50,7 +50,7 @@ class MeasuredDetector:
     """Its scores are probabilities of needing help."""
     report: DetectionReport
     cost_ms: float
-    """Of one call about one step."""
+    """Cost of one call about one step."""
     saved: str = ""
     """Folder of it with its conformal threshold; empty where a composite policy cannot use it."""
 

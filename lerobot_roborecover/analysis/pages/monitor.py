@@ -53,7 +53,7 @@ class Measured:
     """One monitor on one dataset."""
 
     name: str
-    """Of the dataset."""
+    """Name of the dataset."""
     frames: MonitorFrames
     report: MonitorReport
 

@@ -26,7 +26,7 @@ class Arm:
     rewind_steps: tuple[int, ...]
     """Of its trials: one number, or those of the paper's rule, which asks the scenario's horizon."""
     rows: tuple[TrialRow, ...]
-    """Of all its runs. Trials are numbered on from run to run."""
+    """Rows of all its runs. Trials are numbered on from run to run."""
     runs: tuple[tuple[str, tuple[TrialRow, ...]], ...] = ()
     """Name and rows of every run, where the policy is a method of several; else empty."""
     unreached: bool = False
@@ -182,7 +182,7 @@ def _differences(first: TrialRow, second: TrialRow) -> str:
 
 
 def sequential_remarks(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> list[str]:
-    """Which arms were watched while they ran, and what came of it."""
+    """Which arms were compared while they ran, and with which result."""
     remarks = []
     for record in records:
         for arm in arms:

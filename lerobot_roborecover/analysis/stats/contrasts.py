@@ -22,7 +22,7 @@ class Contrast:
     a: str
     b: str
     difference: Estimate
-    """Of the two rates, in [-1, 1]."""
+    """Difference of the two rates, in [-1, 1]."""
     p: float
     """Two-sided p-value of the paired sign-flip permutation test; NaN without a common scenario."""
     p_holm: float

@@ -80,7 +80,7 @@ class Alarms:
     """What a detector does at a threshold, asked from the handoff on."""
 
     threshold: tuple[float, ...]
-    """Of either half of the scenarios; empty for the detector's own decisions."""
+    """Threshold of either half of the scenarios; empty for the detector's own decisions."""
     clean: int
     """First states with a successful clean rollout."""
     clean_alarmed: Estimate
@@ -112,7 +112,7 @@ class DetectionReport:
     """Everything about one detector."""
 
     rankings: dict[str, Ranking]
-    """By label: `DEVIATED`, `WILL_FAIL`; without one that has no frames of both kinds."""
+    """Rankings by label: `DEVIATED`, `WILL_FAIL`; without one that has no frames of both kinds."""
     conformal: Alarms
     """At thresholds that promise a false-alarm rate, each half of the scenarios at that of the other."""
     own: Alarms | None

@@ -64,7 +64,7 @@ class WeightedMean:
 
     value: float | np.ndarray
     variance: float | np.ndarray
-    """Of the mean, between units; NaN for fewer than two."""
+    """Variance of the mean, between units; NaN for fewer than two."""
     units: float | np.ndarray
     effective: float | np.ndarray
     """Units of one weight that would weigh as these do: 1 over the sum of their squared weights."""

@@ -35,7 +35,7 @@ class MonitorReport:
     """TN, FP, FN, TP."""
     unparsed: int
     metrics: dict[str, Estimate]
-    """By the names of `METRICS`."""
+    """Metrics by the names of `METRICS`."""
     episodes: EpisodeMetrics
     precision_recall: Curve
     """x recall, y precision; the area is the average precision."""

@@ -44,7 +44,7 @@ class PowerAssumptions:
     """What is believed of two policies and of the scenarios."""
 
     rate: float
-    """Of the one that is thought to be worse, in (0, 1)."""
+    """Rate of the one that is thought to be worse, in (0, 1)."""
     sd: float
     """Standard deviation of a policy's true rates between scenarios, at `rate`: 0 where all are equally hard,
     sqrt(rate (1 - rate)) where every scenario is always or never solved."""
@@ -79,7 +79,7 @@ class Plan:
     scenarios: int | None
     """That separate it with the wanted power; None where it takes more than `MOST_SCENARIOS`."""
     power: float
-    """By the formula, at so many scenarios."""
+    """Power by the formula, at so many scenarios."""
     simulated: float
     """With the exact test, by simulation; NaN where there are too many scenarios."""
 

@@ -58,7 +58,7 @@ class StartRates:
     rates: np.ndarray
     """(P, N) in [0, 1]; columns are first states where the trials are initial-state ones, else scenarios."""
     resampling: Resampling
-    """Of the N columns."""
+    """Resampling of the N columns."""
 
     @property
     def means(self) -> np.ndarray:

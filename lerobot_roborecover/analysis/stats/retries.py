@@ -32,7 +32,7 @@ class Attempts:
 
     title: str
     rows: tuple[Mapping[int, tuple[TrialRow, ...]], ...]
-    """Of every run, by scenario index."""
+    """Rows of every run, by scenario index."""
     trials: np.ndarray
     """(R, N) int: attempts of every run; those without a row are failures that took the whole horizon. 0
     where the policy was not run."""

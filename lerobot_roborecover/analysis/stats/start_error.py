@@ -32,7 +32,7 @@ class StartSummary:
     not_run: int
     """Starts outside the tolerance."""
     medians: tuple[float, ...]
-    """By `MEASURES`; NaN where none was taken."""
+    """Medians by `MEASURES`; NaN where none was taken."""
     ninety: tuple[float, ...]
     """The ninth decile."""
     reset_s: float

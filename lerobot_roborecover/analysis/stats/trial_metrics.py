@@ -25,7 +25,7 @@ class Metric:
     """One number of a trial."""
 
     title: str
-    """Of the column, with its unit."""
+    """Title of the column, with its unit."""
     of: Callable[[TrialRow], float]
     """The trial's value; `NONE` leaves the trial out."""
     share: bool

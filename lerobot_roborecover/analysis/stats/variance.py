@@ -23,7 +23,7 @@ class VarianceSplit:
     within: float
     """Mean variance of one trial within a scenario."""
     standard_error: float
-    """Of the RSR as measured, for scenarios drawn from a population of such scenarios."""
+    """Standard error of the RSR as measured, for scenarios drawn from a population of such scenarios."""
     one_more_trial: float
     """The standard error with one more trial of every scenario (N more trials)."""
     one_more_scenario: float

@@ -31,7 +31,7 @@ class Discussion:
     round: int
     """2 for the first after the blind pass."""
     candidates: Mapping[str, Mapping[str, Any]]
-    """By id: `why` there was no consensus, and the `votes`."""
+    """Candidates by id: `why` there was no consensus, and the `votes`."""
 
     @classmethod
     def of(cls, round_number: int, open_candidates: Mapping[str, tuple[str, Sequence[Vote]]]) -> Discussion:

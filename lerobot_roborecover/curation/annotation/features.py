@@ -52,7 +52,7 @@ class EpisodeFeatures:
 
     sheet: EpisodeInfo
     readings: dict[int, Reading] = field(default_factory=dict)
-    """By frame."""
+    """Readings by frame."""
 
     def frames(self) -> np.ndarray:
         """(n,) frames looked at, in order."""

@@ -58,7 +58,7 @@ class Vote:
     stage: str = ""
     deviation: str = ""
     reason: str = ""
-    """Of a discard: a key of `DISCARD_REASONS`."""
+    """Reason of a discard: a key of `DISCARD_REASONS`."""
     comment: str = ""
     seconds: float = 0.0
     """Time spent on the candidate, as the page measured it."""

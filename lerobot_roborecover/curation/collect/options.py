@@ -53,7 +53,7 @@ class CollectOptions:
     starts: Starts
     """Which initial states."""
     seed: int = RELEASE_SEED
-    """Of the perturbation, of the policy's noise, and of controllers that draw."""
+    """Seed of the perturbation, of the policy's noise, and of controllers that draw."""
     horizon: int = option(0, metavar="STEPS")
     """Budget of each task, of the rollouts and of what is built from them (the platform's)."""
     perturb: bool = False
@@ -84,7 +84,7 @@ class CollectOptions:
     With 1 the result does not depend on their number.
     """
     device: str | None = None
-    """Of the policy."""
+    """Device of the policy."""
     env: tuple[str, ...] = internal(())
     """`name=value` of the recovery env type: what the policy sees."""
     policy_options: tuple[str, ...] = internal(())
@@ -100,7 +100,7 @@ class CollectOptions:
     retry_errors: bool = False
     """Roll out again what broke in an earlier run."""
     description: str = ""
-    """Of the dataset."""
+    """Description of the dataset."""
     license: str | None = option(None, parse=license_argument)
     """Licence by the Hub's identifier, of the dataset; none is assumed."""
 

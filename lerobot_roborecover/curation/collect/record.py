@@ -32,7 +32,7 @@ class RecorderSettings:
     """How rollouts are recorded; plain values, so that they travel to a worker."""
 
     seed: int = 0
-    """Of the perturbation and of controllers that draw."""
+    """Seed of the perturbation and of controllers that draw."""
     expert: str = ""
     """Name of the scripted controller; empty where a policy drives."""
     perturbed_steps: int = PERTURBED_STEPS
@@ -51,7 +51,7 @@ class Record:
     margin_rad: np.ndarray
     """(T + 1,) float64: distance of the arm's joints from their limits; NaN where unknown."""
     workspace: Workspace | None
-    """Of the reset, where the simulator knows it."""
+    """Workspace of the reset, where the simulator knows it."""
     solved_after: int | None = field(init=False)
     """Actions after which the task's predicate first held, or None."""
 

@@ -30,7 +30,7 @@ def controller_of(options: CollectOptions) -> str:
 
 
 def _policy_facts(options: CollectOptions) -> PolicyMetadata | None:
-    """Who the policy is, by its files and options; None for an expert."""
+    """Identity of the policy, from its files and options; None for an expert."""
     if not options.policy:
         return None
     from lerobot_roborecover.evaluation.loading import policy_config

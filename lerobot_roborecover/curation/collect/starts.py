@@ -24,7 +24,7 @@ class RolloutSpec(TrialStart):
     driver: str
     """Recorded name of the controller."""
     trial: int
-    """Of the rollouts from this start."""
+    """Trial of the rollouts from this start."""
     perturbed: bool
     """Whether the driver's actions are perturbed."""
     twin: bool = False

@@ -49,7 +49,7 @@ class WriterConfig:
     slots: int
     fps: int
     versions: Mapping[str, str]
-    """Of the simulator."""
+    """Versions of the simulator."""
     frames: str
     """What is rendered; names the parts, so that another size is rendered anew."""
     video: VideoSettings

@@ -1,4 +1,4 @@
-"""What a build calls for each stage: the stage's own function, and its words for what came of it.
+"""What a build calls for each stage: the stage's own function, and the text of its result.
 
 Lines for people go where the build's own go; those on how far a stage is go to standard error.
 """

@@ -69,9 +69,9 @@ class ScreenRequest:
     retry: Sequence[str] = option((), text="", metavar="OUTCOMES", parse=_outcomes)
     """Run invalid trials of these outcomes again, e.g. policy_error,timeout."""
     run_seed: int = 1000
-    """Of the trials."""
+    """Run seed of the trials."""
     device: str | None = None
-    """Of the policies."""
+    """Device of the policies."""
     slots: int = option(0, name="num-workers", old=("slots",))
     """Simulators at once (one per core, or CPU of a cluster)."""
     workplace: Backend = LOCAL
@@ -115,7 +115,7 @@ class Screening:
     found: list[Screened]
     """Empty where only a shard's trials were run."""
     rows: Mapping[str, Sequence[TrialRow]]
-    """By the policy's name."""
+    """Rows by the policy's name."""
 
 
 def screen_dataset(
@@ -213,7 +213,7 @@ def _trials(
 
 
 def describe(request: ScreenRequest, made: Screening) -> str:
-    """What came of a screening: the tables, the funnel, and the command that follows."""
+    """Returns the result of a screening as text: the tables, the funnel, and the command that follows."""
     if request.shard:
         return f"part {request.shard}: trials in {request.trials}; join with --trials-from {request.trials}"
     rule, policies = request.rule, len(request.policies)

@@ -33,10 +33,10 @@ CURTAILED_LEAST = ValidationRule.runs
 
 @dataclass(frozen=True)
 class ScreenRule:
-    """Who stays; the defaults are the paper's."""
+    """Which scenarios stay; the defaults are the paper's."""
 
     trials: int = 5
-    """Of each policy on each scenario."""
+    """Trials of each policy on each scenario."""
     keep: tuple[str, str] = option(KEEP, metavar=("FEWEST", "MOST"))
     """Successes of all policies together that stay: two counts, or two shares of all trials (0.1 0.9: 2 to 18
     of 20)."""
@@ -120,7 +120,7 @@ class Screened:
 
     scenario: Scenario
     counts: Mapping[str, PolicyCount]
-    """By the policy's name in this screening."""
+    """Counts by the policy's name in this screening."""
     rule: ScreenRule
 
     @property

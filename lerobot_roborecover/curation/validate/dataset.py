@@ -53,11 +53,11 @@ _SCHEMA = 1
 @dataclass(frozen=True)
 class Validation:
     replays: Mapping[str, Replays]
-    """By scenario id."""
+    """Replays by scenario id."""
     decisions: Sequence[Decision]
     """On every scenario, those of people included."""
     page: Path
-    """Of the contact sheets."""
+    """Page of the contact sheets."""
 
 
 def validate_dataset(
@@ -108,7 +108,7 @@ def validate_dataset(
 
 
 def describe(request: ValidationRequest, made: Validation) -> str:
-    """What came of a validation: the distribution, the funnel, and the command that follows."""
+    """Returns the result as text: the distribution, the funnel, and the command that follows."""
     return "\n".join(
         (
             format_validation(made.replays, made.decisions, request.rule) + "\n",

@@ -34,7 +34,7 @@ class Encoder:
     codec: str
     pix_fmt: str
     options: Mapping[str, str]
-    """Of the codec."""
+    """Options of the codec."""
     fps: int
     keyframe_interval: int
 
@@ -51,7 +51,7 @@ class Originals:
     how: str
     """Where they are from, for people."""
     encoders: Mapping[str, Encoder]
-    """By camera, where they are from video; empty where they are lossless."""
+    """Encoders by camera, where they are from video; empty where they are lossless."""
 
 
 def read_encoders(root: Path) -> dict[str, Encoder]:

@@ -59,7 +59,7 @@ class ReplayJob:
     scenario: Scenario
     runs: tuple[DrawnRun, ...]
     options: Mapping[str, Any]
-    """Of the simulator."""
+    """Options of the simulator."""
     rollout: OriginalRollout | None = None
     originals: Originals | None = None
     """None compares no frames."""

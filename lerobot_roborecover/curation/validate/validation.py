@@ -39,9 +39,9 @@ class ValidationRule:
     runs: int = 3
     """Screening runs drawn of each scenario."""
     seed: int = 42
-    """Of the draw."""
+    """Seed of the draw."""
     tolerance_mm: float = HANDOFF_TOLERANCE_M * 1e3
-    """Of end effectors and objects.
+    """Tolerance of end effectors and objects.
 
     The largest displacement, millimetres.
     """
@@ -114,7 +114,7 @@ class Replays:
     bodies: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """Poses at the recovery point, in metres and as quaternion xyzw, as the first run's replay met them."""
     versions: Mapping[str, str] = field(default_factory=dict)
-    """Of the simulator that replayed, as `Simulator.fingerprint` names them."""
+    """Versions of the simulator that replayed, as `Simulator.fingerprint` names them."""
 
     @property
     def eef_mm(self) -> float:

@@ -54,7 +54,7 @@ class DataOptions:
     Counted from the recovery point both ways.
     """
     seed: int = 0
-    """Of the split and the choice of frames."""
+    """Seed of the split and the choice of frames."""
 
     def __post_init__(self):
         check_seed(self.seed)

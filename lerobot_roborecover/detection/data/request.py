@@ -49,9 +49,9 @@ class MonitorRequest:
     """Folder of the policies' trials, kept between runs (OUT.trials)."""
     choice: DataOptions = field(default_factory=DataOptions)
     run_seed: int = 1000
-    """Of the policies' trials."""
+    """Run seed of the policies' trials."""
     device: str | None = None
-    """Of the policies."""
+    """Device of the policies."""
     workers: int = option(1, name="num-workers", old=("workers",))
     """Processes that replay and render."""
     license: str | None = option(None, parse=license_argument)

@@ -51,7 +51,7 @@ class ForkArm:
         return f"{self.kind}:{value}" if value else self.kind
 
     def config(self, base: PreTrainedConfig, correction_steps: int) -> PreTrainedConfig:
-        """Who acts in it.
+        """The policy that acts in it.
 
         Args:
             base: the policy of the logged trials.

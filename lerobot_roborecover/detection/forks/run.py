@@ -71,7 +71,7 @@ class ForkRequest:
     correction_steps: int = 30
     """Steps of a correction policy."""
     device: str | None = None
-    """Of the policies."""
+    """Device of the policies."""
     slots: int = option(0, name="num-workers", old=("slots",))
     """Simulators at once (as roborecover eval)."""
     max_batch: int = 1
@@ -91,7 +91,7 @@ class ForkRequest:
 class ForkResult:
     log: Path
     rows: tuple[TrialRow, ...]
-    """Of the forks that were asked for."""
+    """Rows of the forks that were asked for."""
     parents: int
     dropped: Counter
     """Why other trials of the logs were not forked."""

@@ -24,7 +24,7 @@ class EnvSource:
     package: str = ""
     """Module whose import registers `<package>/<task>`."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    """Of `gymnasium.make`."""
+    """Kwargs of `gymnasium.make`."""
     config: Mapping[str, Any] = field(default_factory=dict)
     """A LeRobot `EnvConfig` as draccus encodes it, `type` among it, whose `create_envs` makes the env."""
     hub: str = ""

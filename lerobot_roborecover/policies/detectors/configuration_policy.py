@@ -34,15 +34,15 @@ class FeatureNetworkConfig(DetectorConfig):
     hidden_dim: int = 64
     """Width of its hidden layer."""
     steps: int = 600
-    """Of training."""
+    """Steps of training."""
     batch_size: int = 256
     learning_rate: float = 1e-3
     weight_decay: float = 1e-2
     dropout: float = 0.2
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     width: int = 0
-    """Of the features; filled when it is fitted."""
+    """Width of the features; filled when it is fitted."""
     labels: dict[str, int] = field(default_factory=dict)
     """How many of each label it was fitted to."""
 
@@ -68,4 +68,4 @@ class RoboRecoverRecoveryGainConfig(FeatureNetworkConfig):
     threshold: float | None = 0.0
     """Gain above which it alarms; `roborecover detect evaluate` never sets less than 0."""
     arm: str = ""
-    """Of the forks that it is fitted to, or how that begins (`correction`); empty where they have one."""
+    """Arm of the forks that it is fitted to, or how that begins (`correction`); empty where they have one."""

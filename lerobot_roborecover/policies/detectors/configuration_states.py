@@ -29,9 +29,9 @@ class RoboRecoverStateDistanceConfig(DetectorConfig):
     max_states: int = 20_000
     """Training states that are kept, drawn evenly."""
     seed: int = 0
-    """Of that draw."""
+    """Seed of that draw."""
     instructions: list[str] = field(default_factory=list)
-    """Of the training states; filled when they are fitted."""
+    """Instructions of the training states; filled when they are fitted."""
 
     def check(self) -> None:
         """A method, a neighbour and something to look at."""

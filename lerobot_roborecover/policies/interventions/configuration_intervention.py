@@ -49,9 +49,9 @@ class RoboRecoverInterventionConfig(NotTrained, PreTrainedConfig):
     """A base policy, and what may step in for it (paper, "Benchmark-Guided Recovery Interventions")."""
 
     base: MemberConfig = field(default_factory=MemberConfig)
-    """Who acts."""
+    """The policy that acts, unless an intervention does."""
     correction: MemberConfig = field(default_factory=MemberConfig)
-    """Who acts for `correction_steps`, in modes that end in `correction`."""
+    """The policy that acts for `correction_steps`, in modes that end in `correction`."""
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
     """Who decides when, in modes that start with `monitor`; with `human` as well, where one is given."""
     mode: str = "direct"

@@ -51,7 +51,7 @@ class InterventionState:
     left: int = 0
     """Steps that the correction policy still has."""
     mark: InterventionMark = field(default_factory=InterventionMark)
-    """Of the next action."""
+    """Mark of the next action."""
     watch: DetectorHistory | None = None
     """The monitor's history of the trial; None without a monitor."""
 

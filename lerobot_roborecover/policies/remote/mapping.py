@@ -119,7 +119,7 @@ class Gripper:
     """What the server's gripper column becomes. Ours on LIBERO: -1 opens, +1 closes."""
 
     column: int
-    """Of the actions as executed; -1 is the last."""
+    """Column of the actions as executed; -1 is the last."""
     threshold: float | None = None
     """With it, values above become `above` and others `below`, before `scale` and `offset`."""
     above: float = 1.0
@@ -133,9 +133,9 @@ class Joined:
     """Actions that come in parts."""
 
     keys: tuple[str, ...]
-    """Of arrays (n, A_i), put side by side."""
+    """Keys of arrays (n, A_i), put side by side."""
     columns: tuple[int, ...]
-    """Of all of them together, in our order."""
+    """Columns of all of them together, in our order."""
 
     def __post_init__(self):
         if not self.keys or min(self.columns, default=-1) < 0:
@@ -193,7 +193,7 @@ class Mapping:
     """One server's interface."""
 
     version: int
-    """Of this format."""
+    """Version of this format."""
     about: str
     """What the mapping speaks to, in a line."""
     protocol: Literal["openpi", "vla_eval", "gr00t"] = "openpi"

@@ -51,7 +51,7 @@ class RemoteTrial:
 
     session: str
     seed: int | None
-    """Of the trial's noise; used by `roborecover serve` alone."""
+    """Seed of the trial's noise; used by `roborecover serve` alone."""
     step: int = 0
     """Requests answered so far."""
     frames: deque[dict[str, Any]] = field(default_factory=deque)

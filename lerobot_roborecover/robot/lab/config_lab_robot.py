@@ -15,9 +15,9 @@ class LabRobotConfig(RobotConfig):
     world: str = "table"
     """`table` (a point mass and a puck; milliseconds a step) or `metaworld`."""
     task: str = ""
-    """Of the world; empty takes its first."""
+    """Task of the world; empty takes its first."""
     seed: int = 0
-    """Of the first scene and of all noise; a new scene takes the next one."""
+    """Seed of the first scene and of all noise; a new scene takes the next one."""
     size: int = 96
     """Rows and columns of the cameras' pictures."""
     tags: bool = False

@@ -35,7 +35,7 @@ class AnnotateConfig:
     votes: Path | None = option(None, metavar="FOLDER")
     """Of all votes (DATASET/meta/roborecover/votes)."""
     seed: int = 0
-    """Of the order in which each annotator sees the episodes."""
+    """Seed of the order in which each annotator sees the episodes."""
     only: Path | None = option(None, metavar="LIST")
     """A further round over what `roborecover curate agree --discuss` lists."""
     examples: bool = True

@@ -42,13 +42,13 @@ class TeleopConfig:
     view_size: int = option(320, name="view", metavar="PIXELS")
     """Size of the live pictures."""
     size: int | None = option(None, metavar="PIXELS")
-    """Of the dataset's pictures; 0: none (the platform's own)."""
+    """Size of the dataset's pictures; 0: none (the platform's own)."""
     frame_stride: int = internal(1)
     """Steps from one of the dataset's pictures to the next, where rendering is slow."""
     spacemouse: float | None = option(None, nargs="?", const=0.5, metavar="SPEED")
     """Drive with one that is plugged into this machine, too; SPEED is up to 1 (0.5)."""
     options: Mapping[str, Any] = internal(factory=dict)
-    """Of the simulator, beside its pictures."""
+    """Options of the simulator, beside its pictures."""
 
 
 def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:

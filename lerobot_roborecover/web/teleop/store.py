@@ -47,7 +47,7 @@ class Recorded:
     source_record: str
     notes: Mapping[str, Any]
     versions: Mapping[str, str]
-    """Of the simulator."""
+    """Versions of the simulator."""
 
     @property
     def rollout(self) -> Rollout:

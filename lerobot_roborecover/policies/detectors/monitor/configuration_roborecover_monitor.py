@@ -52,7 +52,7 @@ class RoboRecoverMonitorConfig(RewardModelConfig):
     """Keep only each layer's input and compute the rest again: less memory for a piece, and another forward
     pass of the language model."""
     dtype: str = "bfloat16"
-    """Of the base's weights and the arithmetic; adapters are float32."""
+    """Dtype of the base's weights and the arithmetic; adapters are float32."""
     attention: str = "sdpa"
     """Attention implementation of transformers: `sdpa`, `eager` or `flash_attention_2`."""
     max_batch: int = 16
