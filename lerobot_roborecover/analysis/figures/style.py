@@ -54,7 +54,6 @@ _DARK = {
     "#7f5f00": "#c2a54f",
 }
 """A dark page's colour for each of the figures' own."""
-SURFACE_DARK = _DARK[PAPER]
 
 _RC: dict[RcKeyType, Any] = {
     "font.family": "sans-serif",
