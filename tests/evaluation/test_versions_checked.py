@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation import session
+from lerobot_roborecover.evaluation import session, session_checks
 from tests.support.factories import fake_scenario
 from tests.support.loop import evaluate
 
@@ -46,7 +46,7 @@ def test_a_fingerprint_of_another_lerobot_is_not_refused(tmp_path):
 def test_a_wrong_simulator_version_is_refused(tmp_path, monkeypatch):
     root = write_scenarios(tmp_path / "set", [fake_scenario(0)])
     monkeypatch.setattr(
-        session, "version_problems", lambda platform: ["mujoco is 3.4.0; scores require 3.3.2"]
+        session_checks, "version_problems", lambda platform: ["mujoco is 3.4.0; scores require 3.3.2"]
     )
     with pytest.raises(OptionError, match=r"mujoco is 3\.4\.0"):
         evaluate(root, tmp_path / "log.jsonl", trials=1, batch=1)
