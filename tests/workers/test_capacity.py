@@ -90,18 +90,18 @@ def test_here():
 def test_torch_has_no_more_threads_than_a_container_grants(monkeypatch):
     import torch
 
-    from lerobot_roborecover.policies import threads
+    from lerobot_roborecover.policies import determinism
 
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(6)
-        monkeypatch.setattr(threads, "usable_cores", lambda: 3)
-        threads.fit_threads("cuda")
+        monkeypatch.setattr(determinism, "usable_cores", lambda: 3)
+        determinism.fit_threads("cuda")
         assert torch.get_num_threads() == 6
-        threads.fit_threads("cpu")
+        determinism.fit_threads("cpu")
         assert torch.get_num_threads() == 3
-        monkeypatch.setattr(threads, "usable_cores", lambda: 64)
-        threads.fit_threads(torch.device("cpu"))
+        monkeypatch.setattr(determinism, "usable_cores", lambda: 64)
+        determinism.fit_threads(torch.device("cpu"))
         assert torch.get_num_threads() == 3, "what the user set is left alone"
     finally:
         torch.set_num_threads(before)
