@@ -211,9 +211,9 @@ def test_what_else_decides_a_result_counts(mine, key, change):
 
 
 def test_versions_count(mine, key, monkeypatch):
-    monkeypatch.setattr("lerobot_roborecover.evaluation.session.required", lambda platform: {"engine": "1"})
+    monkeypatch.setattr("lerobot_roborecover.platforms.versions.required", lambda platform: {"engine": "1"})
     before = key(mine, env=["strict_versions=false"])
-    monkeypatch.setattr("lerobot_roborecover.evaluation.session.installed", lambda name: "9.9")
+    monkeypatch.setattr("lerobot_roborecover.platforms.versions.installed", lambda name: "9.9")
     assert key(mine, env=["strict_versions=false"]) != before
 
 
