@@ -40,6 +40,7 @@ def meaning(root):
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypatch, capsys):
     perturbed = ["--frames=none", "--expert=expert_biased", "--seeds=0-1", "--perturb", "--part-size=2"]

@@ -27,7 +27,7 @@ from tests.support.loop import evaluate, push_policy
 from tests.support.misbehaving import BAD_ROWS
 from tests.support.processes import PATIENCE_S
 
-COUNT, TRIALS = 3, 2
+COUNT, TRIALS = 2, 2
 
 
 @pytest.fixture(scope="module")

@@ -144,6 +144,7 @@ def test_a_request_that_nobody_answers_leaves_its_trial_unrun(evaluate, tmp_path
         assert [r.outcome for r in evaluate(*policy)] == ["horizon"] * 6
 
 
+@pytest.mark.nightly
 def test_a_server_that_forgot_a_trial_has_it_run_again(checkpoints, evaluate, tmp_path):
     """The rows are those of a server that forgot nothing: act goes on, diffusion begins its trial anew."""
     for kind in ("act", "diffusion"):

@@ -323,6 +323,7 @@ OUTSIDE = """() => [
   }).map((e) => e.id || e.outerHTML)"""
 
 
+@pytest.mark.nightly
 def test_all_is_in_sight_in_a_discussion_at_1024_by_700(browse, tmp_path, dataset):
     """A human-made episode with three votes and comments: the fullest that the page gets."""
     small = candidate_dataset(tmp_path / "rollouts", 6)
