@@ -40,11 +40,11 @@ def test_what_should_not_be_there_or_is_too_large(built):
     with zipfile.ZipFile(built, "a") as packed:
         packed.writestr("tests/test_it.py", b"")
         packed.writestr("lerobot_roborecover/left_over.py", b"")
-        packed.writestr("lerobot_roborecover/data/big.bin", bytes(13_000_000))
+        packed.writestr("lerobot_roborecover/data/big.bin", bytes(12_000_000))
     found = "\n".join(NAMES["check"](built.parent))
     assert "the wheel has tests" in found
     assert "the wheel has lerobot_roborecover/left_over.py, which the clone has not" in found
-    assert "data in the wheel: 13.0 MB; the limit is 13 MB" in found
+    assert "data in the wheel: 12.0 MB; the limit is 12 MB" in found
 
 
 def test_what_is_missing(built):
