@@ -6,7 +6,8 @@ import pytest
 
 from lerobot_roborecover.analysis import pair_tables
 from lerobot_roborecover.analysis.analyse import analyse
-from lerobot_roborecover.analysis.figures.rates import paired_differences
+from lerobot_roborecover.analysis.figures.rates import MOST_COLUMNS, all_figures, paired_differences
+from lerobot_roborecover.analysis.figures.style import MOST_LINES, MOST_ROWS
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.results import MOST_PAIRS
@@ -42,3 +43,22 @@ def test_pairs_that_are_drawn_and_dealt_are_bounded(tmp_path, monkeypatch, polic
         assert figure.description.startswith(f"{best} against every other policy: ")
         assert f"The table has all {pairs} pairs." in figure.description
         assert f"Only {best} against every other policy, of {pairs} pairs." in profiles.notes
+
+
+def test_figures_show_the_best_and_say_so(tmp_path):
+    """120 rows, columns and lines cannot be read, and took a minute of processor time to lay out."""
+    count = 45
+    figures = {figure.name: figure for figure in all_figures(results_of(tmp_path, count))}
+    axes = {name: figure.plot.axes[0] for name, figure in figures.items()}
+    assert len(axes["forest"].get_yticks()) == MOST_ROWS
+    assert len(axes["time_to_recover"].get_lines()) == len(axes["retries"].get_lines()) == MOST_LINES
+    for name, shown in (
+        ("forest", MOST_ROWS),
+        ("time_to_recover", MOST_LINES),
+        ("cells", MOST_COLUMNS[False]),
+    ):
+        assert figures[name].description.endswith(f"The best {shown} of {count} policies."), name
+    for narrow, plot in ((False, figures["cells"].plot), (True, figures["cells"].narrow)):
+        assert len(plot.axes[0].get_xticks()) == MOST_COLUMNS[narrow]
+        assert plot.axes[0].get_xlabel() == f"the best {MOST_COLUMNS[narrow]} of {count} policies"
+    assert len(axes["outcomes"].get_yticks()) == count, "one start of each"

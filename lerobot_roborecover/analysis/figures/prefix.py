@@ -6,6 +6,7 @@ import math
 
 from lerobot_roborecover.analysis.figures.style import (
     LINE,
+    MOST_LINES,
     Figure,
     Plot,
     Width,
@@ -16,12 +17,10 @@ from lerobot_roborecover.analysis.figures.style import (
     marker,
     number,
     short,
+    the_best,
 )
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.prefix import prefix_groups
-
-MOST_LINES = 12
-"""Policies that the figure shows, the best first."""
 
 
 def prefix_figure(results: Results) -> Figure | None:
@@ -62,5 +61,7 @@ def prefix_figure(results: Results) -> Figure | None:
         )
         for group in groups
     )
-    text = f"RSR in per cent by length of the prefix. {words}."
+    text = the_best(
+        f"RSR in per cent by length of the prefix. {words}.", len(names), len(results.recovery.arms)
+    )
     return Figure("prefix", "Recovery by length of the prefix", text, *both(draw))

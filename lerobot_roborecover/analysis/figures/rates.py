@@ -16,6 +16,7 @@ from lerobot_roborecover.analysis.figures.style import (
     HEAT,
     INK,
     LINE,
+    MOST_ROWS,
     ON_COLOUR,
     ON_LIGHT,
     PAPER,
@@ -31,12 +32,16 @@ from lerobot_roborecover.analysis.figures.style import (
     number,
     row_height,
     short,
+    the_best,
 )
 from lerobot_roborecover.analysis.figures.trials import interventions, mosaic, oracle_bars, time_to_recover
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.groups import group_rates, source_matrix
 from lerobot_roborecover.analysis.stats.intervals import Estimate
+
+MOST_COLUMNS = {False: 24, True: 10}
+"""Policies that a heat map shows, the best first, by whether it is narrow; its table has all."""
 
 
 def all_figures(results: Results) -> list[Figure]:
@@ -69,7 +74,7 @@ def forest(results: Results) -> Figure:
     """RSR with intervals, best first; initial-state rates as hollow markers with theirs."""
     panel, chosen = results.recovery, results.compared.policies
     rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
-    order = [chosen[p] for p in reversed(results.best_first)]
+    order = [chosen[p] for p in reversed(results.best_first[:MOST_ROWS])]
     level = f"{100 * results.draws.level:g} % interval"
 
     def draw(width: Width) -> Plot:
@@ -102,7 +107,7 @@ def forest(results: Results) -> Figure:
         return plot
 
     words = "; ".join(f"{panel.arms[p]} {_words(rsr[p])}" for p in reversed(order))
-    text = f"RSR in per cent, best first: {words}."
+    text = the_best(f"RSR in per cent, best first: {words}.", len(order), len(chosen))
     if results.left_out:
         text += f" Not ranked, because not run on all scenarios: {', '.join(results.left_out)}."
     return Figure("forest", "Recovery success rate", text, *both(draw))
@@ -121,12 +126,13 @@ def cell_heat_map(results: Results) -> Figure:
     values = np.array([[e.value for e in g.estimates] for g in groups])
     sparse = [g.underpowered for g in groups]
     plots = _heat_map(values, labels, results.recovery.arms, sparse)
+    arms = results.recovery.arms[: MOST_COLUMNS[False]]
     words = "; ".join(
-        f"{label}: "
-        f"{', '.join(f'{a} {number(100 * v)}' for a, v in zip(results.recovery.arms, row, strict=True))}"
+        f"{label}: {', '.join(f'{a} {number(100 * v)}' for a, v in zip(arms, row, strict=False))}"
         for label, row in zip(labels, values, strict=True)
     )
-    return Figure("cells", "Recovery by stage and deviation type", f"RSR in per cent. {words}.", *plots)
+    text = the_best(f"RSR in per cent. {words}.", len(arms), len(results.recovery.arms))
+    return Figure("cells", "Recovery by stage and deviation type", text, *plots)
 
 
 def source_heat_map(results: Results, matrix: Sequence) -> Figure:
@@ -161,8 +167,11 @@ def _heat_map(
     from matplotlib.patches import Rectangle
 
     shades = colormaps[HEAT]
+    every, all_values = policies, values
 
     def draw(width: Width) -> Plot:
+        policies = every[: MOST_COLUMNS[width.narrow]]
+        values = all_values[:, : len(policies)]
         with drawing() as subplots:
             tall = row_height(width, 0.44)
             plot, axes = subplots(width.inches, 0.9 + tall * len(labels) + 0.25 * width.narrow)
@@ -183,7 +192,7 @@ def _heat_map(
                 if sparse[i] and known:
                     text.set_bbox({"fc": shades(values[i, j]), "ec": "none", "pad": 1.5})
             for cells, style in ((dashed, (0, (4, 2))), (solid, "-")):
-                for i, j in cells:
+                for i, j in (cell for cell in cells if cell[1] < len(policies)):
                     low = 0.12 if width.narrow else 0.42
                     corner, size = (j - 0.44, i - low), (0.88, low + 0.42)
                     axes.add_patch(Rectangle(corner, *size, fill=False, ec=ON_COLOUR, lw=4))
@@ -199,6 +208,8 @@ def _heat_map(
             else:
                 axes.set_yticks(range(len(labels)), labels)
             axes.set(xlim=(-0.5, len(policies) - 0.5), ylim=(len(labels) - 0.5, -0.62))
+            if len(policies) < len(every):
+                axes.set_xlabel(f"the best {len(policies)} of {len(every)} policies")
             axes.tick_params(length=0, labelcolor=INK)
             axes.spines[:].set_visible(False)
         return plot

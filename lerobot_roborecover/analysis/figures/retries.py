@@ -10,13 +10,10 @@ from lerobot_roborecover.analysis.retry_tables import retried
 from lerobot_roborecover.analysis.stats.resampling import masked_mean
 from lerobot_roborecover.analysis.stats.retries import ATTEMPTS, rates_for_steps
 
-MOST_LINES = 16
-"""Policies and interventions that the figure shows, the best first."""
-
 
 def retries(results: Results) -> style.Figure | None:
     """Success with retries against steps; None where every scenario has one trial."""
-    every = [one.attempts for one in retried(results) if one.attempts.most > 1][:MOST_LINES]
+    every = [one.attempts for one in retried(results) if one.attempts.most > 1][: style.MOST_LINES]
     if not every:
         return None
     most = min(max(one.most for one in every), ATTEMPTS[-1])

@@ -18,6 +18,7 @@ from lerobot_roborecover.analysis.figures.style import (
     drawing,
     marker,
     short,
+    the_best,
 )
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
@@ -118,7 +119,7 @@ def _words(names: Sequence[str], ends: Sequence[Sequence[Estimate]], count: int)
     text = (
         f"Success in per cent from initial states and from recovery points, best at recovery first: {pairs}."
     )
-    return text if count <= len(names) else f"{text} The best {len(names)} of {count} policies."
+    return the_best(text, len(names), count)
 
 
 def _spread_out(values: Sequence[float]) -> np.ndarray:

@@ -28,6 +28,10 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", ":")
 INK, SOFT, LINE = "#1a1a1a", "#595959", "#c8c8c8"
+MOST_ROWS = 40
+"""Policies that a figure with a row each shows, the best first; its table has all."""
+MOST_LINES = 16
+"""Policies that a figure with a line each shows, the best first: more lines cannot be told apart."""
 PAPER = "#ffffff"
 """What hollow marks are filled with: the page."""
 PALE = "#e5e5e5"
@@ -172,6 +176,11 @@ def dash(index: int) -> str:
 def short(name: str, limit: int = 28) -> str:
     """A name that fits a figure; matplotlib must not read its dollars as mathematics."""
     return (name if len(name) <= limit else f"{name[: limit - 1]}…").replace("$", r"\$")
+
+
+def the_best(text: str, shown: int, of: int) -> str:
+    """A figure's description, which says so where not all policies are shown."""
+    return text if shown >= of else f"{text} The best {shown} of {of} policies."
 
 
 def number(value: float, spec: str = ".0f") -> str:

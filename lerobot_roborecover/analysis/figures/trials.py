@@ -10,6 +10,8 @@ import numpy as np
 from lerobot_roborecover.analysis.figures.style import (
     INK,
     LINE,
+    MOST_LINES,
+    MOST_ROWS,
     ON_COLOUR,
     PALE,
     PAPER,
@@ -26,6 +28,7 @@ from lerobot_roborecover.analysis.figures.style import (
     number,
     row_height,
     short,
+    the_best,
 )
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.crossfit import Oracle, oracle
@@ -49,11 +52,11 @@ def time_to_recover(results: Results) -> Figure:
     panel = results.recovery
     grid = np.linspace(0, 1, 41)
     curves = budget_estimates(panel, grid, results.draws)
-    order = sorted(range(len(curves)), key=lambda p: -np.nan_to_num(curves[p][-1].value))
+    order = sorted(range(len(curves)), key=lambda p: -np.nan_to_num(curves[p][-1].value))[:MOST_LINES]
 
     def draw(width: Width) -> Plot:
         with drawing() as subplots:
-            plot, axes = subplots(width.inches, 3.4 + 0.24 * len(curves) if width.narrow else 4.2)
+            plot, axes = subplots(width.inches, 3.4 + 0.24 * len(order) if width.narrow else 4.2)
             for p in order:
                 values = 100 * np.array([[e.value, e.low, e.high] for e in curves[p]])
                 style = {"ls": dash(p), "color": colour(p), "marker": marker(p), "markevery": 8}
@@ -70,10 +73,12 @@ def time_to_recover(results: Results) -> Figure:
         return plot
 
     half = "; ".join(
-        f"{name} {100 * c[20].value:.0f} of {100 * c[40].value:.0f}"
-        for name, c in zip(panel.arms, curves, strict=True)
+        f"{panel.arms[p]} {100 * curves[p][20].value:.0f} of {100 * curves[p][40].value:.0f}"
+        for p in range(len(curves))
+        if p in order
     )
     text = f"RSR against step budget. At half the horizon, of the final rate in per cent: {half}."
+    text = the_best(text, len(order), len(curves))
     return Figure("time_to_recover", "Time to recover", text, *both(draw))
 
 
@@ -82,7 +87,8 @@ def oracle_bars(results: Results) -> Figure:
     panel, rates = results.ranked, results.ranked_rates
     found = oracle(panel, results.ranked_draws)
     bars = [
-        (panel.arms[p], rates[p], colour(results.compared.policies[p])) for p in reversed(results.best_first)
+        (panel.arms[p], rates[p], colour(results.compared.policies[p]))
+        for p in reversed(results.best_first[:MOST_ROWS])
     ]
     if not math.isnan(found.rate.value):
         bars.append(("best of each scenario, cross-fitted", found.rate, PAPER))
@@ -160,7 +166,7 @@ def mosaic(results: Results) -> Figure:
     """Outcomes of all trials; a row's height is its share of the trials, invalid ones are hatched."""
     from matplotlib.patches import Patch
 
-    arms = results.arms
+    arms = results.arms[: 2 * MOST_ROWS]  # of both starts
     kinds = [kind for kind in Outcome if any(r.outcome == kind for a in arms for r in a.rows)]
     counts = [Counter(row.outcome for row in arm.rows) for arm in arms]
     share = np.array([len(arm.rows) for arm in arms], float)
@@ -213,4 +219,6 @@ def mosaic(results: Results) -> Figure:
         + ", ".join(f"{count[k.value]} {k.value}" for k in kinds if count[k.value])
         for arm, count in zip(arms, counts, strict=True)
     )
+    if len(arms) < len(results.arms):
+        text += f". The first {len(arms)} of {len(results.arms)} arms; the table has all"
     return Figure("outcomes", "How trials ended", f"{text}.", *both(draw))

@@ -8,6 +8,8 @@ many trials, are flipped at random by `scipy.stats.permutation_test`.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy import special, stats
 
@@ -60,12 +62,19 @@ def _exact(whole: np.ndarray) -> float:
     steps = np.abs(whole)
     steps = steps // np.gcd.reduce(steps)
     observed = abs(int(whole.sum()) // int(np.gcd.reduce(np.abs(whole))))
-    total = int(steps.sum())
+    values, counts = np.unique(steps, return_counts=True)
+    return _share_as_far(tuple(values.tolist()), tuple(counts.tolist()), observed)
+
+
+@lru_cache(2**15)  # of many pairs of policies most differ alike
+def _share_as_far(steps: tuple[int, ...], counts: tuple[int, ...], observed: int) -> float:
+    """The share of sign flips of `counts[k]` differences of size `steps[k]` whose sum is that far from zero."""
+    total = sum(step * count for step, count in zip(steps, counts, strict=True))
     # The sum of flipped differences is twice the sum of those that stay positive, less the total.
     chance = np.ones(1)
-    for step, count in zip(*np.unique(steps, return_counts=True), strict=True):
+    for step, count in zip(steps, counts, strict=True):
         own = np.zeros(step * count + 1)
-        own[::step] = _coins(int(count))
+        own[::step] = _coins(count)
         chance = np.convolve(chance, own)
     sums = np.abs(2 * np.arange(total + 1) - total)
     return float(min(1.0, chance[sums >= observed].sum()))
