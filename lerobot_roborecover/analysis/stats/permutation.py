@@ -68,7 +68,7 @@ def _exact(whole: np.ndarray) -> float:
 
 @lru_cache(2**15)  # of many pairs of policies most differ alike
 def _share_as_far(steps: tuple[int, ...], counts: tuple[int, ...], observed: int) -> float:
-    """The share of sign flips of `counts[k]` differences of size `steps[k]` whose sum is that far from zero."""
+    """The share of flips of `counts[k]` differences of size `steps[k]` whose sum is as far from zero."""
     total = sum(step * count for step, count in zip(steps, counts, strict=True))
     # The sum of flipped differences is twice the sum of those that stay positive, less the total.
     chance = np.ones(1)
