@@ -217,9 +217,12 @@ def test_a_policy_that_rolls_back_first(dataset, capsys, tmp_path):
         "--policy.type=roborecover_intervention", "--policy.mode=reversion", f"--policy.base.path={base}",
         "--eval.n_episodes=2", "--runner.slots=2", "--json",
     ])  # fmt: skip
-    found = by_name(capsys.readouterr().out)
+    shown = capsys.readouterr()
+    found = by_name(shown.out)
     assert status == 0, found
     assert found["actions"]["value"].startswith("5 of width 2")
+    for meaningless in ("random weights", "infinite values", "No job name"):
+        assert meaningless not in shown.err
 
 
 def test_a_table_with_remedies(run, tmp_path):
