@@ -13,7 +13,13 @@ import yaml
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.platforms import all_platforms, platform_named
-from lerobot_roborecover.platforms.registry import ENV_PREFIX, env_type_of, platform_names, platform_of
+from lerobot_roborecover.platforms.registry import (
+    ENV_PREFIX,
+    WRAPPED,
+    env_type_of,
+    platform_names,
+    platform_of,
+)
 from lerobot_roborecover.policies.checkpoint import check_checkpoint, nearest_path
 from lerobot_roborecover.utils.config_source import (
     SourceClass,
@@ -177,7 +183,7 @@ class CommandLine:
         near = nearest(kind.removeprefix(ENV_PREFIX), bare)
         hint = f"the nearest is {bare[near]}" if near else f"there are {there}"
         if not near and kind in registrations("lerobot.envs.configs", "EnvConfig"):
-            hint = f"give --env {env_type_of('lerobot')} --env.base.type={kind}"
+            hint = f"give --env {WRAPPED} --env.base.type={kind}"
         raise OptionError(f"--{name}={kind:.80}: not a recovery env type; {hint}")
 
     def find_policy(self) -> None:

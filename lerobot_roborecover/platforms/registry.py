@@ -12,6 +12,8 @@ ENV_PREFIX = "roborecover_"
 """Of every env type."""
 _ENV_TYPES = {"lerobot": "wrapped"}
 """Documented names of env types that are not the platform's; `roborecover_<platform>` works as well."""
+WRAPPED = ENV_PREFIX + _ENV_TYPES["lerobot"]
+"""Env type that runs any of LeRobot's own."""
 ROBOT = "robot"
 """Recovery points on real robots: known by name, and in no list, because it has no simulator."""
 FAMILY_MEMBERS = ("lerobot_pusht", "lerobot_aloha")
