@@ -79,6 +79,7 @@ COMMANDS = (
     Command("robot restore", "robot_restore", "Put robot and scene back; measure how far off."),
     Command("robot run", "robot_run", "Run a plan of points and policies, blind."),
     Command("robot rate", "robot_rate", "Rate recorded trials a second time, blind."),
+    Command("robot fieldtrial", "robot_fieldtrial", "Let fieldtrial schedule and label the trials."),
     Command("check policy", "check_policy", "Try a policy for a few steps.", "check-policy"),
     Command("check platform", "check_platform", "Check that states are rebuilt exactly.", "check-platform"),
 )  # fmt: skip

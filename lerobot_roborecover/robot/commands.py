@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -104,6 +105,9 @@ class PlanRunConfig(RobotSession):
     """Who gives the verdicts; a pseudonym."""
     stop_after: int = 0
     """End after so many trials; 0 goes on to the plan's end."""
+    trial: str = ""
+    """POINT:CODE runs the next trial of that point and code alone, for a program that keeps the order; exit
+    status 0 is a success, 1 a failure, 3 an invalid trial."""
     inference: InferenceEngineConfig = field(default_factory=SyncInferenceConfig)
     """LeRobot's inference engine: sync or rtc."""
 
@@ -264,6 +268,7 @@ def run_restore(argv: Sequence[str]) -> int:
 def run_plan(argv: Sequence[str]) -> int:
     """`roborecover robot run`."""
     from lerobot_roborecover.policies.command_line import run_with_arguments
+    from lerobot_roborecover.robot.fieldtrial import TRIAL_ID
     from lerobot_roborecover.robot.plan import lock_plan, read_plan
     from lerobot_roborecover.robot.run import RobotRun, RunConfig
     from lerobot_roborecover.robot.run_journal import RunJournal
@@ -272,16 +277,23 @@ def run_plan(argv: Sequence[str]) -> int:
     def command(config: PlanRunConfig) -> int:
         if not config.rater:
             raise OptionError("--rater: say who gives the verdicts, a name or a pseudonym")
+        point, colon, code = config.trial.rpartition(":")
+        if config.trial and not (point and code):
+            raise OptionError(f"--trial={config.trial}: write POINT:CODE, as the plan's lock has them")
         locked, points = lock_plan(read_plan(config.plan), config.out)
         journal = RunJournal(config.out)
         try:
             with session(config) as made:
                 how = RunConfig(
-                    config.out, config.rater, config.joint_limits, config.inference, config.stop_after
-                )
+                    config.out, config.rater, config.joint_limits, config.inference, config.stop_after,
+                    (point, code) if colon else None, os.environ.get(TRIAL_ID, "")
+                )  # fmt: skip
                 RobotRun(made.robot, locked, points, journal, made.console, how, made.teleop).run()
         finally:
             journal.close()
+        if colon:
+            (row,) = list(journal.rows().values())[-1:]
+            return {"success": 0, "horizon": 1}.get(row["outcome"], 3)
         print(next_command(["report", str(journal.log), "--out", "REPORT"]))
         return 0
 

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.robot import RobotTrial, StartError
 from lerobot_roborecover.logs.row import EvalProtocol, RunExtent, TrialRow, make_row
 from lerobot_roborecover.robot.connection import RobotError, calibration_sha256, check_point
@@ -43,6 +44,10 @@ class RunConfig:
     """LeRobot `InferenceEngineConfig`; None is synchronous."""
     stop_after: int = 0
     """End after so many trials; 0 goes on to the plan's end."""
+    only: tuple[str, str] | None = None
+    """Point and code of the one trial that is run, where another program keeps the order."""
+    external: str = ""
+    """That program's name of the trial."""
 
 
 class RobotRun:
@@ -91,14 +96,22 @@ class RobotRun:
 
         for point in self._by_id.values():
             check_point(point, self.robot, self.config.limits)
-        for name in self.plan.plan.policies:
-            warm_up(self._context(name))
-        done = 0
+        done, only, judged = 0, self.config.only, None
         pending = self.journal.pending()
         if pending is not None:
             self.say(f"trial {pending['order'] + 1} was run and has no verdict yet")
-            self._judge(self.plan.trials[pending["order"]], pending)
+            judged = self.plan.trials[pending["order"]]
+            self._judge(judged, pending)
             done += 1
+        if only is not None:
+            if judged is None or (judged.point, judged.code) != only:
+                trial = self._next_of(*only)
+                warm_up(self._context(trial.policy))
+                self.console.release()
+                self._trial(trial)
+            return len(self.journal.rows())
+        for name in self.plan.plan.policies:
+            warm_up(self._context(name))
         while not self.config.stop_after or done < self.config.stop_after:
             finished = self.journal.rows()
             left = [t for t in self.plan.trials if t.order not in finished]
@@ -123,6 +136,26 @@ class RobotRun:
         self.console.show("over", f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done.")
         self.say(f"{pluralize(total, 'trial')} of {len(self.plan.trials)} in {self.journal.log}")
         return total
+
+    def _next_of(self, point: str, code: str) -> PlannedTrial:
+        """The next trial of one point and code; one that was invalid is taken back and run again.
+
+        Raises:
+            OptionError: the plan has none, or all of them are done.
+        """
+        planned = [t for t in self.plan.trials if (t.point, t.code) == (point, code)]
+        valid = (Outcome.SUCCESS, Outcome.HORIZON)
+        rows = self.journal.rows()
+        left = [t for t in planned if t.order not in rows or rows[t.order]["outcome"] not in valid]
+        if not planned:
+            raise OptionError(f"--trial={point}:{code}: the plan has no such point and code")
+        if not left:
+            raise OptionError(
+                f"--trial={point}:{code}: all {pluralize(len(planned), 'trial')} of it are done"
+            )
+        if left[0].order in rows:
+            self.journal.note("undo", order=left[0].order)
+        return left[0]
 
     def _undo(self) -> None:
         """Takes the latest verdict back and asks for it again where the trial was rolled out."""
@@ -150,6 +183,7 @@ class RobotRun:
         )
         values = {
             "order": trial.order,
+            "external": self.config.external,
             "start_error": None if restored.error is None else restored.error.as_json(),
             "reset_s": restored.reset_s,
             "attempts": restored.attempts,

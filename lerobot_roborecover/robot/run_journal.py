@@ -79,6 +79,11 @@ class RunJournal:
         waiting = [record for order, record in rollouts.items() if order not in done]
         return waiting[-1] if waiting else None
 
+    def external(self) -> dict[str, int]:
+        """The trial's place by the name that another program has given it (`RunConfig.external`)."""
+        records = self._journal.records
+        return {r["external"]: r["order"] for r in records if r["kind"] == "restored" and r.get("external")}
+
     def put_right(self) -> None:
         """Makes the trial log hold the rows that count, and no others."""
         text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in self.rows().values())

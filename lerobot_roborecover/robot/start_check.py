@@ -11,7 +11,8 @@ import numpy as np
 from lerobot_roborecover.logs.robot import CameraError, StartError
 from lerobot_roborecover.robot.connection import RobotError, asking, positions
 from lerobot_roborecover.robot.points import PointSet, RobotPoint
-from lerobot_roborecover.robot.vision import Reference, compare
+from lerobot_roborecover.robot.reference import Reference
+from lerobot_roborecover.robot.vision import compare
 
 _LOOKS = 3
 """Observations that a measurement averages over, to be rid of noise and of pictures that are late."""

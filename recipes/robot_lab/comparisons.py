@@ -17,16 +17,16 @@ from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.utils.journal import append_records, plain_records
 from recipes.robot_lab.bench import POLICIES, Bench, ExactTrials, policy
 
-REPEATS = 2
+REPEATS, EXACT_REPEATS = 1, 2
 TOLERANCE = {"joint": 4.0, "object_px": 1.0, "background_px": 1.0}
 MOTION = {"speed": 300.0, "tolerance": 2.0, "max_lag": 250.0, "max_detour": 50.0}
 PLACING_SD_MM, MAX_TRIES = 4.0, 4
-OFFSETS_MM = (5.0, 10.0, 20.0, 40.0)
+OFFSETS_MM = (10.0, 20.0, 40.0)
 MARGIN = 0.10
 """Change of RSR below which a start error is called borne."""
 AA_POLICY, AA_NAMES = "bias_45", ("first", "second")
-AA_POINTS, AA_REPEATS, AA_STUDIES = 20, 4, 200
-AA_SIZES = ((20, 2), (12, 2), (20, 4))
+AA_POINTS, AA_REPEATS, AA_STUDIES = 20, 2, 200
+AA_SIZES = ((20, 2), (12, 2), (20, 1))
 """Points and repeats of the A/A studies; the first size is the primary one."""
 SEED = 5
 
@@ -99,8 +99,8 @@ def exact(bench: Bench, path: Path, offsets_mm: Sequence[float]) -> list[dict[st
         trials = ExactTrials(robot, {n: policy(bench.out, n, bias) for n, bias in POLICIES.items()})
         for number, point in enumerate(bench.points.points):
             for name in POLICIES:
-                for repeat in range(REPEATS):
-                    for offset_mm in offsets_mm:
+                for offset_mm in offsets_mm:
+                    for repeat in range(REPEATS if offset_mm else EXACT_REPEATS):
                         record: dict[str, Any] = {
                             "point": point.id, "policy": name, "repeat": repeat, "offset_mm": offset_mm
                         }  # fmt: skip

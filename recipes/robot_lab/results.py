@@ -73,7 +73,9 @@ def part_b(rows: Sequence[TrialRow], true_mm: np.ndarray, exact: Sequence[dict[s
         Column("RSR %, restored", "percent"), Column("Restored less exact, points", "points"),
         Column("p", "p"), Column("The same, valid trials alone", "points"),
     )  # fmt: skip
-    notes = (f"{WHERE} Two trials of each policy from each point and start; {len(rows)} restored.",)
+    notes = (
+        f"{WHERE} From each point one trial of each policy with a restored start, two with the exact one.",
+    )
     rates = Table("restored", "RSR with restored starts and with exact replay", columns, tuple(found), notes)
     return [rates, _measured(rows, true_mm)]
 

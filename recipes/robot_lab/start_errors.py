@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.robot.reference import Reference
 from lerobot_roborecover.robot.start_check import StartCheck, Tolerance
-from lerobot_roborecover.robot.vision import Reference, compare
+from lerobot_roborecover.robot.vision import compare
 from lerobot_roborecover.utils.journal import append_records, plain_records
 from recipes.robot_lab.bench import FIRST_SCENE, Bench, lab, replay
 
-POINTS, PLACINGS = 10, 20
+POINTS, PLACINGS = 5, 20
 MAX_ERROR_MM = 30.0
 SEED = 11
 TAG_SIDE_MM = 60.0
@@ -78,7 +79,7 @@ def _offsets() -> np.ndarray:
 
 
 def _table(out: Path, name: str, setup: Setup) -> Iterator[dict[str, Any]]:
-    bench = Bench(out / setup.folder, setup.options, POINTS)
+    bench = Bench(out / "setups" / setup.folder, setup.options, POINTS)
     points = bench.points
     tolerance = Tolerance(tag_side_mm=TAG_SIDE_MM if setup.options.get("tags") else 0.0)
     with bench.lab() as robot:

@@ -67,12 +67,12 @@ def plan_of(made, **changes):
 def go(made, folder, robot, operator, **changes):
     from lerobot_roborecover.robot.run import RobotRun, RunConfig
 
-    stop_after = changes.pop("stop_after", 0)
+    stop_after, only = changes.pop("stop_after", 0), changes.pop("only", None)
     locked, points = lock_plan(plan_of(made, **changes), folder)
     lines: list[str] = []
     journal = RunJournal(folder)
     try:
-        config = RunConfig(folder, "kim", stop_after=stop_after)
+        config = RunConfig(folder, "kim", stop_after=stop_after, only=only, external="t-1" if only else "")
         RobotRun(robot, locked, points, journal, Console(operator), config, say=lines.append).run()
     finally:
         journal.close()
@@ -265,6 +265,40 @@ def test_points_of_another_robot_calibration_or_reach_are_refused(made, tmp_path
                 check_point(replace(point, **change), robot)
         with pytest.raises(RobotError, match=r"outside its calibrated -1.0 to 1.0"):
             check_point(point, robot, {"y.pos": (-1.0, 1.0)})
+
+
+def test_another_program_runs_single_trials_and_its_labels_replace_the_verdicts(made, tmp_path):
+    from lerobot_roborecover.robot.fieldtrial import take_labels
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    locked, points = lock_plan(plan_of(made), tmp_path)
+    only = (points.points[0].id, locked.codes["good"])
+    with lab(made) as robot:
+        careless = SimulatedOperator(robot, sd_mm=0.0, bias_mm=(60.0, 0.0), max_tries=1)
+        (refused,), _ = go(made, tmp_path, robot, careless, only=only)
+        operator = Spoken(SimulatedOperator(robot, sd_mm=0.0), running=[Answer("success")])
+        (row,), _ = go(made, tmp_path, robot, operator, only=only)
+        with pytest.raises(OptionError, match="all 1 trial of it are done"):
+            go(made, tmp_path, robot, operator, only=only)
+        with pytest.raises(OptionError, match="the plan has no such point and code"):
+            go(made, tmp_path, robot, operator, only=("elsewhere", "A"))
+    assert (refused.outcome, row.outcome) == ("state_mismatch", "success")
+    assert row.scenario_id == only[0]
+    label = {"trial_id": "t-1", "status": "completed", "success": False, "operator": "lee"}
+    exported, said = tmp_path / "exported.jsonl", []
+    exported.write_text(json.dumps(label) + "\n" + json.dumps({**label, "trial_id": "t-2"}) + "\n")
+    assert take_labels(tmp_path, exported, said.append) == 1
+    (labelled,) = read_trial_log(tmp_path / "trials.jsonl")
+    assert (labelled.outcome, labelled.robot["verdict"], labelled.robot["rater"]) == (
+        "horizon",
+        "failure",
+        "lee",
+    )
+    assert "1 trial of fieldtrial has no verdict here, e.g. t-2" in said[-1]
+    assert take_labels(tmp_path, exported, said.append) == 0
+    exported.write_text("no export\n")
+    with pytest.raises(ScenarioError, match="is not what `fieldtrial export"):
+        take_labels(tmp_path, exported, said.append)
 
 
 def test_a_full_disk_stops_before_a_trial(made, tmp_path, monkeypatch):

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.robot.lab.table_camera import TableCamera
+from lerobot_roborecover.robot.reference import Reference, background_shift
 from lerobot_roborecover.robot.vision import (
-    Reference,
-    background_shift,
     compare,
     find_tags,
     ghost,
