@@ -15,13 +15,16 @@ from lerobot_roborecover.datasets.certificate import (
     CERTIFICATE_FILE,
     describe_certificate,
     read_certificate,
+    stale_reason,
     write_certificate,
 )
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import encode_png, last_frames
+from lerobot_roborecover.datasets.load import builtin_names
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import Pose, ScenarioError
+from tests.support.doc_blocks import ROOT
 from tests.support.factories import fake_scenario
 
 
@@ -124,6 +127,17 @@ def test_any_text_survives_writing(certified, tmp_path):
     strange = replace(found, processor='a,"b\n{"', inexact=[replace(found.inexact[0], reason='x,",\n"y')])
     write_certificate(tmp_path / FOLDER / CERTIFICATE_FILE, strange)
     assert read_certificate(tmp_path) == strange
+
+
+@pytest.mark.parametrize("name", builtin_names(shipped=True))
+def test_a_shipped_certificate_is_of_the_shipped_set(name):
+    root = ROOT / "lerobot_roborecover" / "data" / name
+    found = read_certificate(root)
+    if found is None:
+        return  # docs/publish.md says which have none
+    assert stale_reason(root, found) == ""
+    assert found.exact == found.covered
+    assert found.largest_mm == 0
 
 
 REPLAY = Replay("a", 0.0, True, "", True, {}, {}, {"camera": 1.0}, True, "a")
