@@ -82,7 +82,8 @@ def main() -> None:
     files = {name: args.out / path for name, path in FILES.items()}
     if args.store:
         for name, path in files.items():
-            atomic_write(STORED / f"{name}.jsonl.gz", gzip.compress(path.read_bytes(), mtime=0))
+            data = path.read_bytes().replace(f"{args.out}/".encode(), b"")  # not where it was run
+            atomic_write(STORED / f"{name}.jsonl.gz", gzip.compress(data, mtime=0))
     if args.stored:
         files = {name: STORED / f"{name}.jsonl.gz" for name in FILES}
     for part in args.part or "abcd":

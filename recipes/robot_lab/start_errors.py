@@ -193,6 +193,11 @@ def accuracy(records: list[dict[str, Any]]) -> Accuracy:
         records: of the set-up; pixels without a scale get that of least squares through zero.
     """
     known = [r for r in records if _value(r) is not None]
+    camera_px = float(
+        np.median([np.nan if r["background_px"] is None else r["background_px"] for r in records])
+    )
+    if not known:
+        return Accuracy(len(records), len(records), *[float("nan")] * 5, camera_px)
     true = np.array([r["true_mm"] for r in known])
     found = np.array([_value(r) for r in known], float)
     if known and "object_px" in known[0]:
@@ -206,7 +211,7 @@ def accuracy(records: list[dict[str, Any]]) -> Accuracy:
         float(np.quantile(np.abs(gap), 0.9)),
         float((found[true >= 15.0] <= 10.0).mean()),
         float((found[true <= 5.0] > 10.0).mean()),
-        float(np.median([np.nan if r["background_px"] is None else r["background_px"] for r in records])),
+        camera_px,
     )
 
 
