@@ -29,6 +29,8 @@ class CameraError:
     """Normalised correlation of the object region after that shift, -1 to 1."""
     tag_mm: float | None = None
     """Largest shift of a fiducial tag that both pictures show."""
+    moving: bool = False
+    """Whether the camera is on the arm: it shifts with the arm, and says nothing of the scene."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,15 @@ class StartError:
     def worst(self, measure: str) -> float | None:
         """The largest value over cameras of a measure, the lowest of `similarity`; None where none was taken.
 
+        Cameras on the arm are left out.
+
         Args:
             measure: a field of `CameraError`, or `joint`.
         """
         if measure == "joint":
             values = [abs(v) for v in self.joints.values()]
         else:
-            found = [getattr(camera, measure) for camera in self.cameras.values()]
+            found = [getattr(camera, measure) for camera in self.cameras.values() if not camera.moving]
             values = [v for v in found if v is not None]
         if not values:
             return None
@@ -61,8 +65,8 @@ class StartError:
         return {
             "joints": {n: round(float(v), 4) for n, v in self.joints.items()},
             "cameras": {
-                name: {k: None if v is None else round(float(v), 4) for k, v in asdict(camera).items()}
-                for name, camera in self.cameras.items()
+                name: {k: round(float(v), 4) if isinstance(v, float) else v for k, v in asdict(error).items()}
+                for name, error in self.cameras.items()
             },
             "problems": list(self.problems),
         }
@@ -168,14 +172,20 @@ def _start_problem(value: Any) -> str:
         return f"its start_error.joints is not an object of at most {MAX_JOINTS} finite numbers"
     if not isinstance(problems, list) or not all(isinstance(p, str) and len(p) <= 1000 for p in problems):
         return "its start_error.problems is not a list of texts"
-    measures = set(CameraError.__dataclass_fields__)
-    good = isinstance(cameras, dict) and len(cameras) <= MAX_CAMERAS
-    if not good or not all(
-        isinstance(c, dict) and c.keys() == measures and all(v is None or _is_number(v) for v in c.values())
-        for c in cameras.values()
-    ):
+    known = isinstance(cameras, dict) and len(cameras) <= MAX_CAMERAS
+    if not known or not all(map(_is_camera, cameras.values())):
         return f"its start_error.cameras is not an object of at most {MAX_CAMERAS} cameras' measures"
     return ""
+
+
+def _is_camera(value: Any) -> bool:
+    """Whether it has the fields of a `CameraError`; rows of earlier versions lack `moving`."""
+    if not isinstance(value, dict):
+        return False
+    measures = CameraError.__dataclass_fields__.keys() - {"moving"}
+    if value.keys() - {"moving"} != measures or type(value.get("moving", False)) is not bool:
+        return False
+    return all(value[name] is None or _is_number(value[name]) for name in measures)
 
 
 def _is_number(value: Any) -> bool:

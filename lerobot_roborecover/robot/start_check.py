@@ -139,7 +139,10 @@ class StartCheck:
         }
         live = {camera: looks[-1][camera] for camera in self.references}
         cameras = {
-            camera: compare(reference, live[camera], self.tolerance.tag_side_mm or None)
+            camera: replace(
+                compare(reference, live[camera], self.tolerance.tag_side_mm or None),
+                moving=camera in self.tolerance.moving_cameras,
+            )
             for camera, reference in self.references.items()
         }
         error = StartError(joints, cameras)

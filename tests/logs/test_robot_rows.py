@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -32,6 +32,22 @@ def test_a_robots_trial_comes_back_as_it_was(tmp_path):
     assert ERROR.worst("similarity") == 0.93
     assert ERROR.worst("joint") == 0.4
     assert StartError().worst("tag_mm") is None
+
+
+def test_a_camera_on_the_arm_says_nothing_of_the_scene(tmp_path):
+    on_arm = CameraError(object_px=9.0, similarity=0.1, moving=True)
+    error = StartError({}, {"top": CameraError(0.5, 2.0, 0.93), "wrist": on_arm})
+    assert (error.worst("object_px"), error.worst("similarity")) == (2.0, 0.93)
+    assert StartError({}, {"wrist": on_arm}).worst("object_px") is None
+    row = robot_row(robot=replace(TRIAL, start_error=error))
+    log = write_log(tmp_path / "trials.jsonl", [row])
+    (found,) = read_trial_log(log)
+    assert RobotTrial.of_json(found.robot).start_error == error
+    # Rows of earlier versions do not say which cameras are on the arm.
+    log.write_text(log.read_text().replace(', "moving": false', "").replace(', "moving": true', ""))
+    assert "moving" not in log.read_text()
+    (found,) = read_trial_log(log)
+    assert RobotTrial.of_json(found.robot).start_error.worst("object_px") == 9.0
 
 
 def test_a_failed_simulated_trial_still_takes_its_whole_horizon(tmp_path):

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.analysis.stats.detection import WILL_FAIL
+from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.logs.trial_log import TrialLogError, read_trial_log
 from recipes.intervention_timing import ARMS, stored_folder
 from recipes.metaworld.recovery_data import STORED as RECOVERY_DATA
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
+from recipes.robot_lab.__main__ import FILES, STORED, tables
 from tests.support.trial_rows import policy_rows, write_log
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -100,3 +102,27 @@ def test_the_page_on_training_on_recoveries_says_what_is_stored():
     for mixture, of in rates.items():
         row = next(line for line in page.splitlines() if line.startswith(f"| `{mixture}` | ") and "[" in line)
         assert f"| {', '.join(of)} |" in row
+
+
+def test_the_page_on_the_simulated_lab_says_what_is_stored():
+    page = (DOCS / "studies" / "robot_lab.md").read_text(encoding="utf-8").replace("+", "")
+    files = {name: STORED / f"{name}.jsonl.gz" for name in FILES}
+    (placed,), (restored, starts), (alarms,), (borne,) = (tables(part, files) for part in "abcd")
+    for _, placings, _, bias, deviation, ninety, *_ in placed.rows:
+        if bias == bias:  # tags gave no number
+            assert f"| {placings} | {bias:.1f} | {deviation:.1f} | {ninety:.1f} |" in page
+    for row in restored.rows:
+        assert all(in_points(cell) in page for cell in (*row[2:5], row[6]))
+    assert f"per pixel, by the camera that stands still, are {starts.rows[-1][1]}" in page
+    for _, points, repeats, studies, called, _, significant, largest in alarms.rows:
+        row = f"| {points} | {repeats} | {studies} | {called} | {significant} | {100 * largest:.1f} |"
+        assert row in page
+    for policies, offset_mm, rate, difference, *_ in borne.rows:
+        if policies == "both":
+            cells = [f"{offset_mm:.0f}", in_points(rate), *([in_points(difference)] if difference else [])]
+            assert f"| {' | '.join(cells)} |" in page
+
+
+def in_points(found: Estimate) -> str:
+    """As a page shows it."""
+    return f"{100 * found.value:.1f} [{100 * found.low:.1f}, {100 * found.high:.1f}]"
