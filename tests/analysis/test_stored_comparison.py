@@ -14,6 +14,7 @@ from lerobot_roborecover.analysis.stats.detection_pairs import detector_contrast
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stored_comparison import read_comparison
 from lerobot_roborecover.cli.main import main
+from tests.support.shipped_policies import CHECKPOINT
 
 
 def scored(seed: int, gap: float, units: int = 30) -> list[ScoredTrial]:
@@ -67,7 +68,8 @@ def test_the_report_of_stored_scores_says_the_same(first, tmp_path, capsys):
 
 def test_scores_go_with_nothing_that_would_run(first, tmp_path, capsys):
     for name in (["eval-monitor"], ["detect", "evaluate"]):
-        assert main([*name, "--scores", str(first), "--policy", "p", "--out", str(tmp_path / "o")]) == 2
+        asked = [*name, "--scores", str(first), "--policy", CHECKPOINT, "--out", str(tmp_path / "o")]
+        assert main(asked) == 2
         assert "--policy does not belong to --scores" in capsys.readouterr().err
 
 

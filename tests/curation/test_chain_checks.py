@@ -84,7 +84,7 @@ def problems(tmp_path, policy):
         ("split.sizes", {"train": 0.5, "test": 0.6}, "split: fractions"),
         ("split.disjoint_by", "colour", "split: "),
         ("render.frames", 33, "render: frames 33"),
-        ("render.env", {"nothing": 1}, "render: unrecognized arguments: --nothing=1"),
+        ("render.env", {"nothing": 1}, "render: env: there is no option --env.nothing"),
         ("publish", {"repo_id": "no slash"}, "publish: repo_id 'no slash' is not like ORG/NAME"),
         ("publish", {"repo_id": "a/b"}, "publish: no licence"),
     ],
@@ -224,7 +224,7 @@ def test_scripted_controllers_are_listed_without_an_out(capsys):
     assert "expert_biased" in (text := capsys.readouterr().out)
     assert "metaworld" not in text
     with pytest.raises(SystemExit):
-        main(["collect", "--expert", "expert"])
+        main(["collect", "--expert", "expert", "--env.type=roborecover_fake"])
     assert "required: --out" in capsys.readouterr().err
 
 

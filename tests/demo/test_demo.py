@@ -31,6 +31,7 @@ from lerobot_roborecover.utils.determinism import policy_kernels
 from tests.support.exactness import row_as_recorded
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.processes import PATIENCE_S
+from tests.support.shipped_policies import CHECKPOINT
 
 STAND_IN = '''
 """Writes the rows that lerobot-eval would; argument FAIL_AFTER ends it early, as a crash would."""
@@ -248,7 +249,7 @@ def test_two_demos_in_one_folder_are_kept_apart(settings, tmp_path):
 
 def test_bad_input_ends_with_one_line_and_status_2(settings, tmp_path, capsys, dataset):
     def refused(*args: str) -> str:
-        assert cli.main(["demo", "--out", str(tmp_path / "o"), "--policy.path", "p", *args]) == 2
+        assert cli.main(["demo", "--out", str(tmp_path / "o"), "--policy.path", CHECKPOINT, *args]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         return line
 

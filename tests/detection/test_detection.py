@@ -14,6 +14,7 @@ from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_scenario, save_policy
 from tests.support.played_trials import played_trial, played_trials
+from tests.support.shipped_policies import CHECKPOINT
 from tests.support.trial_rows import write_log
 
 pytestmark = pytest.mark.lerobot
@@ -156,7 +157,7 @@ def test_one_of_the_two_ways_to_measure_is_asked_for(capsys):
     assert "--scenarios is missing" in capsys.readouterr().err
     assert main(["eval-monitor", "--detector", "constant", "--data", "d"]) == 2
     assert "--scenarios is missing" in capsys.readouterr().err
-    asked = ["--detector", "constant", "--scenarios", "s", "--policy", "p"]
+    asked = ["--detector", "constant", "--scenarios", "s", "--policy", CHECKPOINT]
     assert main(["eval-monitor", *asked, "--data", "d"]) == 2
     assert "--data does not belong to --detector" in capsys.readouterr().err
 

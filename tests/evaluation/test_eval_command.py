@@ -391,7 +391,7 @@ def test_threads_of_the_policy_do_not_spin_unless_asked_to(mine, wanted):
         "from lerobot_roborecover.cli.main import main\n"
         "def seen(argv): print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules); return 0\n"
         "sys.modules['lerobot_roborecover.evaluation.runner'] = types.SimpleNamespace(main=seen)\n"
-        "main(['eval', '--env.type=roborecover_fake'])"
+        "main(['eval', '--env.type=roborecover_fake', '--policy.type=act'])"
     )
     env = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
     env |= {} if mine is None else {"OMP_WAIT_POLICY": mine}

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from lerobot_roborecover.utils.determinism import CORE_TYPE, KERNELS, VARIABLE, has_kernels, policy_kernels
+from tests.support.shipped_policies import CHECKPOINT
 
 needs_kernels = pytest.mark.skipif(not has_kernels(), reason="no AVX2 in this processor: nothing to do")
 CODE = "from lerobot_roborecover.utils.determinism import core_type_in_use; print(core_type_in_use())"
@@ -76,7 +77,7 @@ def test_square_roots_in_float64_round_to_the_float32_that_is_right():
 
 
 @pytest.mark.parametrize(
-    "words", [["build", "missing.yaml"], ["screen", "missing", "--policy", "missing", "--out", "out"]]
+    "words", [["build", "missing.yaml"], ["screen", "missing", "--policy", CHECKPOINT, "--out", "out"]]
 )
 def test_commands_whose_outcomes_are_stored_choose_a_policys_kernels(words, tmp_path):
     """Before torch is loaded; what the user has chosen stays."""

@@ -10,10 +10,11 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
+from tests.support.shipped_policies import CHECKPOINT
 
 COMMANDS = {
     "collect": ["--env.type=roborecover_fake", "--task=toy", "--expert=expert", "--seeds=0", "--out=OUT"],
-    "screen": ["OUT", "--policy=x", "--out=OUT"],
+    "screen": ["OUT", f"--policy={CHECKPOINT}", "--out=OUT"],
     "validate": ["OUT", "--trials-folder=OUT", "--out=OUT"],
 }
 
