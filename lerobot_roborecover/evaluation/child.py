@@ -13,6 +13,8 @@ from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
 """Unless the caller's environment says otherwise."""
+NESTED = "ROBORECOVER_NESTED"
+"""Variable of a command that another command runs: the outer one says what comes next."""
 _running: set[subprocess.Popen] = set()
 _POLL_S = 0.5
 CANNOT_START = "cannot start "
@@ -45,7 +47,7 @@ def run_program(
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL, stdout=stream, stderr=None if stream is None else subprocess.STDOUT,
-            env={**DEFAULTS, **os.environ, **variables}, preexec_fn=ends_with_this(),
+            env={**DEFAULTS, **os.environ, **variables, NESTED: "1"}, preexec_fn=ends_with_this(),
         )  # fmt: skip
         _running.add(process)
         try:

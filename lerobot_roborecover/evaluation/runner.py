@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from lerobot.utils.utils import init_logging
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.errors import OptionError, check_seed
+from lerobot_roborecover.evaluation.child import NESTED
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
@@ -36,7 +38,7 @@ from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.renamed_fields import move_old_fields
 from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
-from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import Backend
 
 logger = logging.getLogger(__name__)
@@ -265,7 +267,7 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
     if watch is not None and record is not None:
         print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
         if watch.decided:
-            return 0
+            return _say_next(cfg, log.path)
     go_on = f"run the same command with --env.trial_log={log.path} --output_dir={out}"
     if stop.reason:
         print(
@@ -280,6 +282,15 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
             file=sys.stderr,
         )
         return 1
+    return _say_next(cfg, log.path)
+
+
+def _say_next(cfg: RecoveryEvalConfig, log: Path) -> int:
+    """Names the command that reports a finished run; not for a shard, or an arm of another command."""
+    out, (_, shards) = cfg.folder, cfg.recovery_env.shard_of()
+    if NESTED not in os.environ and shards == 1:
+        logged = out if log == out / "trials.jsonl" else log
+        print(next_command(["report", str(logged), "--out", str(out / "report")]))
     return 0
 
 

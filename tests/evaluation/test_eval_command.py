@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import write_scenarios
+from lerobot_roborecover.evaluation.child import NESTED
 from lerobot_roborecover.evaluation.progress import ProgressLine
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
@@ -84,7 +86,7 @@ def rows_of(out: Path):
     return read_trial_log(out / "trials.jsonl")
 
 
-def test_the_same_rows_as_lerobot_eval(run, whole, capsys):
+def test_the_same_rows_as_lerobot_eval(run, whole, capsys, monkeypatch):
     out = run()
     rows = rows_of(out)
     assert outcomes(rows) == whole
@@ -93,7 +95,15 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys):
     assert info["overall"]["n_episodes"] == COUNT * TRIALS
     by_id = {t["task_id"]: t["metrics"]["successes"] for t in info["per_task"]}
     assert all(by_id[r.scenario_id][r.trial] == r.success for r in rows)
-    assert "Recovery success (RSR)" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "Recovery success (RSR)" in shown
+    named = f"next: roborecover report {out} --out {out / 'report'}"
+    assert shown.splitlines()[-1] == named
+    monkeypatch.setenv(NESTED, "1")
+    run()
+    assert "next: " not in capsys.readouterr().out, "the outer command says what comes next"
+    assert main(shlex.split(named)[2:]) == 0
+    assert (out / "report" / "report.html").exists()
 
 
 def test_real_time_is_the_same_under_lerobot_eval(run, whole, dataset, policy, tmp_path):
