@@ -31,6 +31,7 @@ from lerobot_roborecover.evaluation.short_names import JSON, long_names
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.findings import (
     Check,
+    Status,
     failure,
     format_report,
     ok,
@@ -123,7 +124,10 @@ def examine(cfg: CheckPolicyConfig) -> list[Check]:
         if isinstance(start, Check):
             return [*findings, start]
         if own is not None:
-            findings += _look(cfg, own, run, scenarios, scenario, start)
+            looks = _look(cfg, own, run, scenarios, scenario, start)
+            findings += looks
+            if any(c.name in ("observation", "inputs") and c.status is Status.FAILURE for c in looks):
+                return findings  # the policy would only raise
         steps = take_steps(watched, run, scenario, start, seed=cfg.seed, steps=cfg.check.steps)
         if isinstance(steps, Check):
             return [*findings, steps]

@@ -322,9 +322,12 @@ def test_a_camera_that_the_environment_lacks(run, tmp_path, command):
 
 
 def test_a_state_of_another_width(run, tmp_path):
+    """The table says what is wrong, so the policy is not asked: it would only raise, with a traceback."""
     policy = save_policy(tmp_path / "act", "act", state=9)
-    status, out, _ = run("check-policy", policy, "--json")
+    status, out, errors = run("check-policy", policy, "--json")
     assert status == 1
+    assert "actions" not in by_name(out)
+    assert "Traceback" not in errors
     inputs = by_name(out)["inputs"]
     assert inputs["status"] == "failure"
     assert "(4,)" in inputs["value"]
