@@ -26,6 +26,7 @@ import numpy as np
 import yaml
 
 from lerobot_roborecover.errors import MAX_SEED, OptionError
+from lerobot_roborecover.evaluation.early_checks import check_policy_options
 from lerobot_roborecover.policies.identity import policy_identity
 from lerobot_roborecover.robot.approach import MotionConfig
 from lerobot_roborecover.robot.points import PointSet, read_points
@@ -162,6 +163,19 @@ def _numbers[C](kind: type[C], values: Mapping[str, Any]) -> C:
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
+def check_policies(plan: Plan) -> None:
+    """Refuses checkpoints that cannot be loaded, and overrides that their policies do not have.
+
+    Raises:
+        OptionError: names the policy, what is wrong with it, and the nearest that there is.
+    """
+    for name, policy in plan.policies.items():
+        try:
+            check_policy_options(policy.path, policy.overrides)
+        except OptionError as err:
+            raise OptionError(f"plan: policy {name!r:.40}: {err}") from None
+
+
 def lock_plan(plan: Plan, folder: Path) -> tuple[LockedPlan, PointSet]:
     """Draws the order and locks the plan in a run's folder; a locked one must be the same.
 
@@ -170,7 +184,8 @@ def lock_plan(plan: Plan, folder: Path) -> tuple[LockedPlan, PointSet]:
         folder: of the run; made if need be.
 
     Raises:
-        OptionError: the folder holds another plan, or points or policies have changed since.
+        OptionError: the folder holds another plan, points or policies have changed since, or a policy of a
+            plan that is not locked yet cannot be loaded.
         ScenarioError: the points cannot be read.
     """
     points = read_points(plan.points, plan.select)
@@ -193,6 +208,7 @@ def lock_plan(plan: Plan, folder: Path) -> tuple[LockedPlan, PointSet]:
                 " changed since. Go on with the plan as it was, or begin a run in another folder"
             )
     else:
+        check_policies(plan)
         folder.mkdir(parents=True, exist_ok=True)
         document = {"schema_version": SCHEMA_VERSION, "sha256": sha256, "content": content}
         atomic_write(path, json.dumps(document, indent=1, ensure_ascii=False) + "\n")

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import sys
+
 import pytest
 
 from lerobot_roborecover.cli.main import main
+from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.plan import lock_plan, parse_plan
 from lerobot_roborecover.robot.points import write_points
+from tests.support.factories import save_policy
 from tests.support.robot_points import made_point, pictures_of
 
 pytestmark = pytest.mark.lerobot
@@ -35,3 +41,26 @@ def test_what_cannot_be_used_is_one_line(tmp_path, capsys, monkeypatch):
     assert "has no point 'b'; it has a" in refused(capsys, "restore", *LAB, "--points=points", "--point=b")
     assert "is no LeRobotDataset" in refused(capsys, "points", "nothing", "--out", "p", "--quasi-static")
     assert "cannot read trial log" in refused(capsys, "rate", "nothing")
+
+
+def test_policies_of_a_plan_are_checked_before_lerobot_is_imported(tmp_path, capsys):
+    save_policy(tmp_path / "act", "act")
+    save_policy(tmp_path / "pi", "act")
+    plan = tmp_path / "plan.yaml"
+    words = ("run", *LAB, f"--plan={plan}", "--rater=kim", f"--out={tmp_path / 'run'}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "lerobot_roborecover.robot.commands", None)  # whose import is LeRobot's
+        content = {"points": "points", "policies": {"a": str(tmp_path / "act"), "b": str(tmp_path / "pj")}}
+        plan.write_text(json.dumps(content))
+        line = refused(capsys, *words)
+        assert f"plan: policy 'b': --policy.path={tmp_path / 'pj'}" in line
+        assert "there is no such folder" in line
+        content["policies"]["b"] = {"path": str(tmp_path / "pi"), "overrides": ["--n_acton_steps=2"]}
+        plan.write_text(json.dumps(content))
+        line = refused(capsys, *words)
+        assert "plan: policy 'b': there is no option --policy.n_acton_steps" in line
+        assert "n_action_steps" in line
+    write_points(tmp_path / "points", [made_point("a")], {"a": pictures_of(0)})
+    with pytest.raises(OptionError, match="n_action_steps"):
+        lock_plan(parse_plan({**content, "points": str(tmp_path / "points")}), tmp_path / "run")
+    assert not (tmp_path / "run").exists(), "what was refused is not locked, so that it can be mended"
