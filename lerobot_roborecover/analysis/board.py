@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.analysis.options import Options
@@ -108,6 +109,8 @@ class BoardTrials:
     recovery: Panel
     initial: Panel | None
     """Trials of the same policies from initial states; None where there are none."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """First log of every policy's trials from recovery points; none of a name that several entries have."""
 
 
 type ScenarioHashes = frozenset[tuple[str, str]]

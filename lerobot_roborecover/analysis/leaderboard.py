@@ -10,8 +10,9 @@ others down.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,19 +116,30 @@ def make_leaderboard(
             refused.append((f"{key[0]}, {key[1]}", "no trials from recovery points"))
         for scenario_set, members in _sets(usable).items():
             try:
-                boards.append(
-                    make_board(
-                        key, scenario_set, {e: usable[e] for e in members}, logs, options, run_of, records
-                    )
+                board, trials = make_board(
+                    key, scenario_set, {e: usable[e] for e in members}, logs, options, run_of, records
                 )
             except RowsError as err:
                 refused.append((f"{key[0]}, {key[1]}", str(err)))
+                continue
+            files = _files(folder, {e: entries[e].values() for e in members})
+            boards.append((board, replace(trials, files=files)))
     boards.sort(key=lambda found: _order(found[0]))
     return Leaderboard(
         tuple(board for board, _ in boards),
         tuple(dict.fromkeys(refused)),
         tuple(trials for _, trials in boards),
     )
+
+
+def _files(folder: Path, entries: Mapping[tuple, Iterable[tuple[TrialRow, str]]]) -> dict[str, Path]:
+    """First log of every policy's trials from recovery points, where one entry alone has its name."""
+    names = Counter(policy for policy, *_ in entries)
+    return {
+        policy: folder / next(name for row, name in found if row.start == Start.RECOVERY)
+        for (policy, *_), found in entries.items()
+        if names[policy] == 1
+    }
 
 
 def _order(board: Board) -> tuple:

@@ -63,7 +63,7 @@ class Study:
     sequential: tuple[SequentialRecord, ...] = ()
     """Runs of these logs that were watched while they went."""
     files: Mapping[str, Path] = field(default_factory=dict)
-    """First log of every policy, by its name in the report."""
+    """First log of every arm, by its title."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -93,14 +93,11 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     run_of: dict[int, int] = {}
     """By the identity of a row; of rows that are of no run, or of the first, nothing is said."""
     twice = 0
-    files: dict[str, Path] = {}
     runs: dict[str, dict[int, str]] = {}
     records: list[SequentialRecord] = []
     named = list(_files(logs))
     found, unknown = with_first_states([read_log(path, name or None) for name, _, path in named])
     for (name, run, path), log in zip(named, found, strict=True):
-        for policy in log.policies:
-            files.setdefault(name or policy, log.path)
         if run is not None:
             runs.setdefault(name, {}).setdefault(run, _run_name(path))
         if (record := read_record(path)) is not None:
@@ -151,6 +148,11 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     remarks += _check_versions(kept)
     check_runs(kept, runs, run_of)
     arms = stopped(arms_of(kept, runs, run_of), records)
+    file_of: dict[tuple, Path] = {}
+    for log in found:
+        for key in {(row.policy, row.start, row.rewind_steps) for row in log.rows}:
+            file_of.setdefault(key, log.path)
+    files = {arm.title: file_of[arm.policy, arm.start, arm.rewind_steps[0]] for arm in arms}
     remarks += arm_remarks(arms) + sequential_remarks(arms, records)
     return Study(
         kept[0].platform, arms, tuple(remarks), tuple(log.path for log in found), tuple(records), files

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,14 +11,13 @@ from pathlib import Path
 
 from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.headline import headline
-from lerobot_roborecover.analysis.logs import Study, read_study
+from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.options import Gallery, Options
 from lerobot_roborecover.analysis.pages.gallery import check_scenarios
-from lerobot_roborecover.analysis.pages.media import find_clips
+from lerobot_roborecover.analysis.pages.media import find_clips, videos_beside
 from lerobot_roborecover.analysis.pages.report import REPORT_FILES, Extras, ReportFiles, write_report
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.utils.outputs import check_page
 
@@ -79,7 +77,7 @@ def report(
     with _no_garbage_yet():
         results = analyse(study, options)
     with _no_garbage_yet():
-        frames, clips, remarks = _pictures(gallery, out, study, results.recovery)
+        frames, clips, remarks = _pictures(gallery, out, results)
         extras = Extras(frames, clips, tuple(remarks), title, command=command)
         files = write_report(results, out, extras)
     return Report(results, files, (*results.remarks, *remarks))
@@ -108,10 +106,10 @@ def _named(logs: str | Path | Sequence[str | Path] | Mapping[str, str | Path]) -
     return [str(logs)] if isinstance(logs, str | Path) else [str(log) for log in logs]
 
 
-def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[dict, dict, list[str]]:
+def _pictures(gallery: Gallery, out: Path, results: Results) -> tuple[dict, dict, list[str]]:
     frames: dict[str, bytes] = {}
     remarks: list[str] = []
-    ids = [s.id for s in panel.scenarios]
+    study, ids = results.study, [s.id for s in results.recovery.scenarios]
     if gallery.scenarios:
         from lerobot_roborecover.datasets import load_scenarios
 
@@ -136,13 +134,10 @@ def _pictures(gallery: Gallery, out: Path, study: Study, panel: Panel) -> tuple[
     for text in gallery.videos:
         name, rest = split_named(text)
         folders.append((name, Path(rest)))
-    if not folders:  # `eval` leaves its videos beside its log
-        beside = [(name, log.parent / "videos") for name, log in study.files.items()]
-        owners = Counter(folder for _, folder in beside)  # the files' names do not tell policies apart
-        folders = [
-            (name, folder)
-            for name, folder in beside
-            if folder.is_dir() and owners[folder] == 1 and name in panel.arms
-        ]
-    clips, skipped = find_clips(folders, ids, gallery.videos_mb * 2**20)
+    starts = {arm.title: arm.start for arm in study.arms}
+    if not folders:
+        panels = (results.recovery, results.interventions)
+        shown = {title for panel in panels if panel is not None for title in panel.arms}
+        folders = [(arm, f) for arm, f in videos_beside(study.files.items(), starts) if arm in shown]
+    clips, skipped = find_clips(folders, ids, gallery.videos_mb * 2**20, starts)
     return frames, clips, remarks + skipped

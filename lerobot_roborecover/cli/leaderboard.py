@@ -28,7 +28,8 @@ class SpaceOptions:
     render: bool = False
     """Render recovery frames that the scenario sets do not hold."""
     videos: tuple[str, ...] = option((), metavar="NAME=DIR")
-    """A policy's videos or .rrd recordings for the Space; may be given again."""
+    """A policy's videos or .rrd recordings for the Space; may be given again (default: `videos/` beside each
+    log)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,6 +74,29 @@ def test_videos_beside_a_log_are_found_and_start_the_report(tmp_path):
     assert page.count("<video") == 2, "b's, on the first screen and on its card"
 
 
+def test_videos_of_interventions_are_in_the_gallery_with_their_outcomes(tmp_path):
+    """Of a reversion, whose trials another start names, and of a policy beside which a detector acted."""
+    direct = [trial_row(n, success=False, policy="a") for n in range(4)]
+    back = [trial_row(n, policy="a", start="reversion", rewind_steps=20) for n in range(4)]
+    helped = [trial_row(n, policy="a+help", options={"intervention": "reversion"}) for n in range(4)]
+    for folder, rows in (("a", direct), ("back", back), ("helped", helped)):
+        write_log(tmp_path / folder / "trials.jsonl", rows)
+        (tmp_path / folder / "videos").mkdir()
+    names = {
+        "a": "s001_trial0_horizon",
+        "back": "s001_reversion_trial0_success",
+        "helped": "s001_trial0_success",
+    }
+    for folder, name in names.items():
+        (tmp_path / folder / "videos" / f"{name}.mp4").write_bytes(folder.encode())
+    made = report([tmp_path / f for f in names], tmp_path / "out", options=Options(draws=100))
+    page = made.files.html.read_text()
+    for arm, words in (
+        ("a", "not solved"), ("a, 20 steps back", "solved"), ("a+help", "solved"),
+    ):  # fmt: skip
+        assert f'aria-label="{arm} on s001, trial 1, {words}"' in page
+
+
 def test_paths_are_shortened_and_names_and_addresses_are_not():
     assert without_folders("roborecover report /home/me/runs/a/trials.jsonl --out=/tmp/x/y/z") == (
         "roborecover report a/trials.jsonl --out=y/z"

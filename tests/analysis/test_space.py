@@ -81,6 +81,19 @@ def test_media_are_found_by_their_commands_names(tmp_path):
         find_media(tmp_path / "none", ["s1"])
 
 
+def test_videos_beside_the_logs_are_found_without_being_named(tmp_path):
+    for policy in ("a", "b", "c"):
+        log = tmp_path / "logs" / {"c": "b"}.get(policy, policy) / f"{policy}.jsonl"
+        write_log(log, [trial_row(0, policy=policy), trial_row(0, policy=policy, start="initial")])
+        (log.parent / "videos").mkdir(exist_ok=True)
+        for name in ("s000_trial0_success", "s000_initial_trial0_success"):
+            (log.parent / "videos" / f"{name}.mp4").write_bytes(policy.encode())
+    write_space(make_leaderboard(tmp_path / "logs", Options(draws=100)), tmp_path / "out")
+    found = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out" / "media").rglob("*.mp4")}
+    assert found == {"media/0-a/s000.mp4"}, "b and c share a folder, whose names do not tell them apart"
+    assert 'src="media/0-a/s000.mp4"' in (tmp_path / "out" / "scenarios-1.html").read_text()
+
+
 def shown(page):
     return page.eval_on_selector_all(
         "#cards > li", "cards => cards.filter(c => c.offsetParent).map(c => c.dataset.id)"

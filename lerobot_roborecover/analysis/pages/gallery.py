@@ -106,7 +106,6 @@ def make_cards(
         action_folders: where actions of the trials were recorded.
     """
     before = _initial_rows(initial)
-    numbers = {policy: p for p, policy in enumerate(panel.arms)}
     acting = _acting(panel, interventions)
     cards: list[Card] = []
     trials: dict[str, list[ShownTrial]] = {}
@@ -138,7 +137,7 @@ def make_cards(
                     for arm, (rows, scheduled) in shown.items()
                 ),
                 clips=tuple(
-                    _with_outcome(clip, panel.rows.get((numbers.get(clip.policy, -1), n), ()))
+                    _with_outcome(clip, shown.get(clip.policy, ((), 0))[0])
                     for clip in clips.get(scenario.id, ())
                 ),
                 outcome_classes=_classes(run, bool(panel.invalid[:, n].any())),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo
 from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.scenario import Start
 
 _OF_A_FOLDER = ("eval_episode_0.mp4", "replay.rrd")
 """Files that are called alike for all scenarios: the folder names the scenario."""
@@ -17,7 +19,33 @@ TRIALS_SHOWN = 2
 _TRIAL = re.compile(r"(?P<id>.+)_trial(?P<trial>\d+)(_\w+)?")
 
 
-def find_media(folder: Path, ids: Sequence[str]) -> dict[str, list[tuple[int, Path]]]:
+def videos_beside(
+    logs: Iterable[tuple[str, Path]], starts: Mapping[str, Start] | None = None
+) -> list[tuple[str, Path]]:
+    """Folders of the videos that `eval` left beside its logs.
+
+    A folder that several arms of one start share is left out: the names of its videos do not tell arms apart.
+
+    Args:
+        logs: title of each arm and its log.
+        starts: of the arms' trials, by title; by default recovery points.
+
+    Returns:
+        Title and folder of each arm that has videos.
+    """
+    starts = starts or {}
+    beside = dict.fromkeys((arm, log.parent / "videos") for arm, log in logs)
+    owners = Counter((folder, starts.get(arm, Start.RECOVERY)) for arm, folder in beside)
+    return [
+        (arm, folder)
+        for arm, folder in beside
+        if folder.is_dir() and owners[folder, starts.get(arm, Start.RECOVERY)] == 1
+    ]
+
+
+def find_media(
+    folder: Path, ids: Sequence[str], start: Start = Start.RECOVERY
+) -> dict[str, list[tuple[int, Path]]]:
     """Videos and recordings of each scenario, with the numbers of their trials, in that order.
 
     Taken are `<group>_<scenario>/eval_episode_0.mp4` of `lerobot-eval`, `<scenario>_trial<k>_<outcome>.mp4`
@@ -26,6 +54,8 @@ def find_media(folder: Path, ids: Sequence[str]) -> dict[str, list[tuple[int, Pa
     Args:
         folder: where they are, at any depth.
         ids: scenarios to look for.
+        start: of the trials. Of others than recovery points `roborecover eval` alone says the start, in the
+            name: `<scenario>_<start>_trial<k>_<outcome>.mp4`.
 
     Returns:
         Files by scenario id.
@@ -46,22 +76,29 @@ def find_media(folder: Path, ids: Sequence[str]) -> dict[str, list[tuple[int, Pa
         named.setdefault(name, []).append((trial, path))
     found = {}
     for scenario_id in ids:
-        mine = [(0, p) for name, p in grouped if name == scenario_id or name.endswith(f"_{scenario_id}")]
-        mine += sorted(named.get(scenario_id, ()))
+        if start is not Start.RECOVERY:
+            mine = sorted(named.get(f"{scenario_id}_{start.value}", ()))
+        else:
+            mine = [(0, p) for name, p in grouped if name == scenario_id or name.endswith(f"_{scenario_id}")]
+            mine += sorted(named.get(scenario_id, ()))
         if mine:
             found[scenario_id] = mine
     return found
 
 
 def find_clips(
-    folders: Sequence[tuple[str, Path]], ids: Sequence[str], limit_bytes: int
+    folders: Sequence[tuple[str, Path]],
+    ids: Sequence[str],
+    limit_bytes: int,
+    starts: Mapping[str, Start] | None = None,
 ) -> tuple[dict[str, list[TrialVideo]], list[str]]:
     """Videos to put into a page.
 
     Args:
-        folders: name of the policy and where its videos are, at any depth.
+        folders: title of the arm and where its videos are, at any depth.
         ids: scenarios to look for.
         limit_bytes: total size to take in; the rest is left out, and said.
+        starts: of the arms' trials, by title; by default recovery points.
 
     Returns:
         Clips by scenario id, and remarks.
@@ -72,7 +109,7 @@ def find_clips(
     clips: dict[str, list[TrialVideo]] = {}
     used = skipped = 0
     for name, folder in folders:
-        found = find_media(folder, ids)
+        found = find_media(folder, ids, (starts or {}).get(name, Start.RECOVERY))
         every = [(i, trial, path) for i, media in found.items() for trial, path in media[:TRIALS_SHOWN]]
         for scenario_id, trial, path in every:
             size = path.stat().st_size

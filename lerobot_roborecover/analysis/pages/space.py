@@ -12,7 +12,7 @@ from lerobot_roborecover.analysis.board import Board, BoardTrials
 from lerobot_roborecover.analysis.leaderboard import Leaderboard
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo, check_scenarios, gallery_values, make_cards
 from lerobot_roborecover.analysis.pages.leaderboard import BoardGallery, write_leaderboard
-from lerobot_roborecover.analysis.pages.media import find_media
+from lerobot_roborecover.analysis.pages.media import find_media, videos_beside
 from lerobot_roborecover.analysis.pages.page import render_page
 from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.datasets.certificate import describe_certificate
@@ -31,7 +31,8 @@ class SpaceConfig:
     render: bool = False
     """Render recovery frames that the scenario sets do not hold; runs the simulators."""
     media: Sequence[tuple[str, Path]] = ()
-    """A policy's name and the folder of its videos or `.rrd` recordings."""
+    """A policy's name and the folder of its videos or `.rrd` recordings; without any, `videos/` beside each
+    log."""
     action_folders: Sequence[Path] = ()
     """Where actions of the trials were recorded."""
 
@@ -54,11 +55,15 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
     config = config or SpaceConfig()
     remarks: list[str] = []
     pages = [f"scenarios-{n + 1}.html" for n in range(len(found.boards))]
+    beside = [pair for trials in found.trials for pair in trials.files.items()]
+    media = list(enumerate(config.media or videos_beside(beside)))
     with claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages]):
         galleries = []
         for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
             frames, certificate, problems = _frames(board, trials, out, config.render)
-            clips = _media(config.media, trials.recovery, out)
+            given = config.media or videos_beside(trials.files.items())
+            own = [(n, one) for n, one in media if one in given and one[0] in trials.recovery.arms]
+            clips = _media(own, trials.recovery, out)
             cards = make_cards(
                 trials.recovery, frames, clips, trials.initial, action_folders=config.action_folders
             )
@@ -126,13 +131,13 @@ def _scenarios(board: Board, rows: Iterable[Sequence[TrialRow]]) -> ScenarioSet:
     return found
 
 
-def _media(folders: Sequence[tuple[str, Path]], panel: Panel, out: Path) -> dict[str, list[TrialVideo]]:
-    """Copies videos and recordings of a board's policies beside the page."""
+def _media(
+    folders: Sequence[tuple[int, tuple[str, Path]]], panel: Panel, out: Path
+) -> dict[str, list[TrialVideo]]:
+    """Copies numbered folders of videos and recordings of a board's policies beside the page."""
     ids = [s.id for s in panel.scenarios]
     clips: dict[str, list[TrialVideo]] = {}
-    for number, (policy, folder) in enumerate(folders):
-        if policy not in panel.arms:
-            continue
+    for number, (policy, folder) in folders:
         name = re.sub(r"[^A-Za-z0-9]+", "-", policy).strip("-").lower()
         for scenario_id, ((trial, path), *_) in find_media(folder, ids).items():
             target = f"media/{number}-{name}/{scenario_id}{path.suffix}"
