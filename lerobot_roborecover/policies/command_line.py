@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from typing import Any, TextIO, cast
 
 from draccus.utils import DecodingError, ParsingError
 from lerobot.configs import parser
@@ -70,12 +71,46 @@ _SAY_NOTHING = (
     "No pretrained path was provided",  # of our own policy types; random weights are refused (metadata.py)
     "No job name provided",
     "You are instantiating a policy from scratch and its features are parsed from an environment",
+    "Loading weights from local directory",
 )
-"""How warnings of LeRobot's begin that mean nothing in a recovery evaluation."""
+"""How messages of LeRobot's begin that mean nothing in a recovery evaluation."""
 
 
 def _says_something(record: logging.LogRecord) -> bool:
     return not str(record.msg).startswith(_SAY_NOTHING)
+
+
+class _PlainOutput:
+    """Standard output without the lines that say nothing."""
+
+    def __init__(self, stream: TextIO):
+        self._stream, self._line = stream, ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        *lines, self._line = (self._line + text).split("\n")
+        for line in lines:
+            if not line.startswith(_SAY_NOTHING):
+                self._stream.write(f"{line}\n")
+        return len(text)
+
+    def flush(self) -> None:
+        self._stream.write(self._line)
+        self._line = ""
+        self._stream.flush()
+
+
+@contextmanager
+def plain_output() -> Generator[None]:
+    """Leaves out what LeRobot prints and means nothing here; the rest reaches standard output."""
+    plain = _PlainOutput(sys.stdout)
+    with redirect_stdout(cast(TextIO, plain)):
+        try:
+            yield
+        finally:
+            plain.flush()
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
+from lerobot_roborecover.policies.command_line import plain_output
 
 
 def error_words(err: Exception) -> str:
@@ -53,6 +54,8 @@ def load_remedy(err: Exception, inputs: str = "") -> str:
 def plain_loading(label: str, inputs: Callable[[], str] = str) -> Generator[None]:
     """Raises what loading a checkpoint fails with as one line, wherever there is a remedy to say.
 
+    What LeRobot prints and means nothing is left out.
+
     Args:
         label: names the checkpoint.
         inputs: says what gives the inputs that the environment lacks.
@@ -61,7 +64,8 @@ def plain_loading(label: str, inputs: Callable[[], str] = str) -> Generator[None
         OptionError: in the words of the error, with the remedy.
     """
     try:
-        yield
+        with plain_output():
+            yield
     except RoboRecoverError:
         raise
     except Exception as err:  # policies, and what they import, raise types of their own

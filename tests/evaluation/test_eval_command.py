@@ -99,6 +99,7 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys, monkeypatch):
     assert "Recovery success (RSR)" in shown
     named = f"next: roborecover report {out} --out {out / 'report'}"
     assert shown.splitlines()[-1] == named
+    assert "Loading weights" not in shown
     monkeypatch.setenv(NESTED, "1")
     run()
     assert "next: " not in capsys.readouterr().out, "the outer command says what comes next"

@@ -58,3 +58,13 @@ def test_what_a_file_says_of_a_policy_is_said_to_its_own_run_alone(tmp_path):
     second.write_text("steps: 3\n")
     found = [run_with_arguments(policies, "program", [f"--config_path={p}"]) for p in (first, second, first)]
     assert found == [("here", ["--device=cpu"]), (None, []), ("here", ["--device=cpu"])]
+
+
+def test_what_lerobot_prints_for_every_checkpoint_is_left_out(capsys):
+    from lerobot_roborecover.policies.command_line import plain_output
+
+    with plain_output():
+        print("Loading weights from local directory")
+        print("two\nlines", end=" and a half")
+    print()
+    assert capsys.readouterr().out == "two\nlines and a half\n"

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_roborecover.policies.command_line import plain_output
 from lerobot_roborecover.policies.detectors.interface import (
     SEEN,
     TASK,
@@ -150,7 +151,10 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
     from lerobot.rewards.factory import make_reward_pre_post_processors
 
     try:
-        model = get_reward_model_class(config.type).from_pretrained(path, config=config, revision=revision)
+        with plain_output():
+            model = get_reward_model_class(config.type).from_pretrained(
+                path, config=config, revision=revision
+            )
         pre, _ = make_reward_pre_post_processors(config)
     except ImportError as err:
         raise DetectorError(
