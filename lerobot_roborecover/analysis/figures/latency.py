@@ -13,9 +13,8 @@ from lerobot_roborecover.analysis.figures.style import (
     Width,
     both,
     colour,
-    dash,
     drawing,
-    marker,
+    line_style,
     short,
 )
 from lerobot_roborecover.analysis.latency import LatencyRate
@@ -39,7 +38,7 @@ def latency_figure(rates: Sequence[LatencyRate], level: float = LEVEL) -> Figure
                 x = 1e3 * np.array([p.latency_s for p in points])
                 y = 100 * np.array([[p.rate.value, p.rate.low, p.rate.high] for p in points])
                 name = f"{short(policy, width.names)}, {during_inference}"
-                style = {"color": colour(k), "ls": dash(k), "marker": marker(k)}
+                style = line_style(k)
                 axes.plot(x, y[:, 0], lw=2, label=name, **style)
                 axes.fill_between(x, y[:, 1], y[:, 2], color=colour(k), alpha=0.12, lw=0)
             axes.set(

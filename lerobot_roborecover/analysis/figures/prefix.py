@@ -12,9 +12,8 @@ from lerobot_roborecover.analysis.figures.style import (
     Width,
     both,
     colour,
-    dash,
     drawing,
-    marker,
+    line_style,
     number,
     short,
     the_best,
@@ -43,7 +42,7 @@ def prefix_figure(results: Results) -> Figure | None:
                         axes.plot(
                             [x, x], [100 * rate.low, 100 * rate.high], color=colour(p), lw=1.4, alpha=0.6
                         )
-                style = {"ls": dash(p), "color": colour(p), "marker": marker(p), "ms": 7}
+                style = {**line_style(p), "ms": 7}
                 axes.plot(
                     places, [100 * r.value for r in rates], lw=1.8, label=short(name, width.names), **style
                 )

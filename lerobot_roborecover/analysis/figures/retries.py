@@ -24,7 +24,7 @@ def retries(results: Results) -> style.Figure | None:
         with style.drawing() as subplots:
             plot, axes = subplots(width.inches, 3.4 + 0.24 * len(every) if width.narrow else 4.2)
             for p, (one, curve) in enumerate(zip(every, curves, strict=True)):
-                line = {"ls": style.dash(p), "color": style.colour(p), "marker": style.marker(p)}
+                line = style.line_style(p)
                 axes.plot(
                     grid, 100 * curve, lw=2, label=style.short(one.title, width.names), markevery=20, **line
                 )

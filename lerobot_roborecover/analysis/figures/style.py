@@ -173,6 +173,11 @@ def dash(index: int) -> str:
     return DASHES[(index + index // len(COLOURS)) % len(DASHES)]
 
 
+def line_style(index: int) -> dict[str, str]:
+    """Colour, line style and marker of policy `index`, as matplotlib takes them."""
+    return {"color": colour(index), "ls": dash(index), "marker": marker(index)}
+
+
 def short(name: str, limit: int = 28) -> str:
     """A name that fits a figure; matplotlib must not read its dollars as mathematics."""
     return (name if len(name) <= limit else f"{name[: limit - 1]}…").replace("$", r"\$")

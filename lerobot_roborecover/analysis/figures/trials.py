@@ -21,8 +21,8 @@ from lerobot_roborecover.analysis.figures.style import (
     Width,
     both,
     colour,
-    dash,
     drawing,
+    line_style,
     marker,
     name_rows,
     number,
@@ -59,7 +59,7 @@ def time_to_recover(results: Results) -> Figure:
             plot, axes = subplots(width.inches, 3.4 + 0.24 * len(order) if width.narrow else 4.2)
             for p in order:
                 values = 100 * np.array([[e.value, e.low, e.high] for e in curves[p]])
-                style = {"ls": dash(p), "color": colour(p), "marker": marker(p), "markevery": 8}
+                style = {**line_style(p), "markevery": 8}
                 name = short(panel.arms[p], width.names)
                 axes.plot(100 * grid, values[:, 0], lw=2, label=name, **style)
                 if len(curves) <= 8 and np.isfinite(values).all():
