@@ -46,7 +46,11 @@ def benchmark():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "part", ["rates", "retries", "tasks", "macro", "differences", "ratios", "steps", "agreement", "tests"]
+    "part",
+    [
+        *("rates", "retries", "tasks", "macro", "ratios", "steps", "tests"),
+        *(pytest.param(part, marks=pytest.mark.nightly) for part in ("differences", "agreement")),
+    ],
 )
 def test_intervals_cover_and_tests_are_right(benchmark, part):
     """The sizes 8 and 20 of the benchmark, where few samples still tell; seeded, so that it cannot flicker.

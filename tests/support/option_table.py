@@ -154,14 +154,14 @@ def written(name: str) -> dict[str, Options]:
 
 
 def as_text(tables: dict[str, dict[str, Options]]) -> str:
-    """An option a line."""
+    """An option a line, by name."""
     parts = []
     for name, table in tables.items():
         commands = [
             f"  {json.dumps(command)}: {{\n"
-            + ",\n".join(f"   {json.dumps(k)}: {json.dumps(v)}" for k, v in options.items())
+            + ",\n".join(f"   {json.dumps(k)}: {json.dumps(v)}" for k, v in sorted(options.items()))
             + "\n  }"
-            for command, options in table.items()
+            for command, options in sorted(table.items())
         ]
         parts.append(f" {json.dumps(name)}: {{\n" + ",\n".join(commands) + "\n }")
     return "{\n" + ",\n".join(parts) + "\n}\n"
