@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import os
 import re
 
 import pytest
@@ -112,3 +113,10 @@ def test_reasons_are_given_for_what_is_not_run():
     unrun = [b for b in [*PYTHON, *all_blocks("bash")] if b.why_not_run]
     assert unrun
     assert all(len(b.why_not_run) > 10 for b in unrun)
+
+
+@pytest.mark.parametrize("command", ["scripts/demo.sh", "scripts/test.sh"])
+def test_the_readme_has_the_commands_that_need_nothing_set_up(command):
+    begins = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert any(line.split(" ")[0] == command for line in begins)
+    assert os.access(ROOT / command, os.X_OK)
