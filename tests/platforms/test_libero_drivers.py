@@ -20,8 +20,6 @@ KINDS = {
     "goal:7": "a knob is turned",
     "goal:8": "a bowl is put down beside a cabinet",
 }
-SOME = ("10:9",)
-"""Those of the default run; the nightly run takes all."""
 
 
 def start(number: str, init: int):
@@ -29,10 +27,8 @@ def start(number: str, init: int):
     return task, PLATFORM.resets(task, Starts(init_states=(init,)))[0]
 
 
-@pytest.mark.parametrize(
-    "number",
-    [n if n == "goal:7" else pytest.param(n, marks=pytest.mark.nightly) for n in KINDS],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", KINDS)
 def test_each_kind_of_goal_is_solved(simulator, number):
     task, reset = start(number, 1)
     assert PLATFORM.unsupported_reason(task) == ""

@@ -192,6 +192,7 @@ def test_place_object_scale_and_put_object_cabinet_know_theirs(x, arm):
     assert task.origin_z == pytest.approx(0.8)
 
 
+@pytest.mark.nightly
 @on_standin
 def test_trials_of_bad_scenarios_become_rows_and_the_run_goes_on(tmp_path):
     good = Scenario(
