@@ -18,7 +18,6 @@ from lerobot_roborecover.curation.continuations import Continuation
 from lerobot_roborecover.detection.data.choice import BALANCED, NATURAL, TRAIN, DataOptions, choose
 from lerobot_roborecover.detection.data.data import write_monitor_data
 from lerobot_roborecover.policies.detectors.interface import DetectorError
-from lerobot_roborecover.policies.detectors.loading import load_monitor
 from tests.support.factories import fake_scenario
 from tests.support.training import lerobot_train
 
@@ -26,6 +25,13 @@ pytestmark = pytest.mark.lerobot
 
 CONFIGS = Path(__file__).parents[2] / "policies" / "train"
 CAMERA, STATE, ENV_STATE = "observation.image", "observation.state", "observation.environment_state"
+
+
+def load_monitor(*args, **options):
+    """Ours, imported where it is needed: it loads torch."""
+    from lerobot_roborecover.policies.detectors import loading
+
+    return loading.load_monitor(*args, **options)
 
 
 @pytest.fixture(scope="module")
