@@ -29,7 +29,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.determinism import core_type_in_use
-from lerobot_roborecover.utils.options import option
+from lerobot_roborecover.utils.options import option, parse_shard
 from lerobot_roborecover.utils.text import align, pluralize
 
 _SHOWN = 20
@@ -141,10 +141,7 @@ def _chosen(options: CertifyOptions, every: ScenarioSet) -> ScenarioSet:
     chosen = every.select(options.select)
     if options.split:
         chosen = chosen.select(f"split={options.split}")
-    part, _, parts = options.shard.partition("/")
-    if not (part.isdecimal() and parts.isdecimal()):
-        raise OptionError(f"--shard={options.shard}: K/N with 0 <= K < N, e.g. 0/4")
-    chosen = chosen.shard(int(part), int(parts))
+    chosen = chosen.shard(*parse_shard(options.shard, "--shard"))
     if not len(chosen):
         raise OptionError(f"--shard={options.shard} is empty: use fewer parts")
     return chosen

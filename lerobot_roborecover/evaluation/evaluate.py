@@ -12,7 +12,7 @@ import random
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyRunner, ProvidesRunner
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.temporary import TemporaryFolder
-from lerobot_roborecover.utils.text import pluralize
+from lerobot_roborecover.utils.text import nearest, pluralize
 
 logger = logging.getLogger(__name__)
 
@@ -200,8 +200,15 @@ def _scenario_set(scenarios: Any, env: Any) -> ScenarioSet:
 def _env_config(env: Mapping[str, Any] | RecoveryEnvConfig | None, platform: str) -> RecoveryEnvConfig:
     if env is not None and not isinstance(env, Mapping):
         return copy(env)
+    kind = env_type(platform)
+    known = [f.name for f in fields(kind)]
+    for name in env or {}:
+        if name not in known and name != "type":
+            near = nearest(name, known)
+            hint = f"the nearest is {near!r}" if near else f"there are {', '.join(known)}"
+            raise OptionError(f"env: there is no option {name!r}; {hint}")
     try:
-        return draccus.decode(env_type(platform), {**platform_named(platform).env_defaults, **(env or {})})
+        return draccus.decode(kind, {**platform_named(platform).env_defaults, **(env or {})})
     except (draccus.utils.DraccusException, ValueError, TypeError) as err:
         raise OptionError(f"env={dict(env or {})}: {' '.join(str(err).split())}") from None
 

@@ -6,12 +6,15 @@ import re
 
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.evaluation.trial import Trial
+from lerobot_roborecover.logs.policy_settings import CALLABLE
 from lerobot_roborecover.policies.runner import Replica
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.utils.text import pluralize
 
 FIRST_TRIALS = 3
 """Trials that must fail alike; all of a shorter run."""
+_CHECK = "'roborecover check policy' with the same options says what policy and environment do not agree on"
+_CALLABLE = 'docs/api.md, "Any policy", says what a callable is given and what it returns'
 
 
 class PolicyFailedError(RoboRecoverError, RuntimeError):
@@ -28,10 +31,12 @@ class FirstTrials:
 
     Args:
         trials: of the run.
+        policy_type: of the policy, `policy_settings.CALLABLE` among others.
     """
 
-    def __init__(self, trials: int):
+    def __init__(self, trials: int, policy_type: str | None = None):
         self._limit = min(FIRST_TRIALS, trials)
+        self._remedy = _CALLABLE if policy_type == CALLABLE else _CHECK
         self._held: list[tuple[Trial, Replica]] = []
 
     def hold(self, trial: Trial, replica: Replica) -> bool:
@@ -51,8 +56,7 @@ class FirstTrials:
         reason = " ".join(trial.reason.removeprefix("at step 0: ").split()).rstrip(".")
         raise PolicyFailedError(
             f"{first} ended in the same policy error before any action, and the run was stopped: {reason}. "
-            "No row was written. 'roborecover check policy' with the same options says what the policy and "
-            "the environment do not agree on; correct that, then run the command again"
+            f"No row was written. {self._remedy}; correct that, then run it again"
         )
 
     def release(self) -> list[tuple[Trial, Replica]]:

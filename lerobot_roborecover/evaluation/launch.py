@@ -110,7 +110,7 @@ def run_work_items(
     if not todo:
         return RunResult()
     if not run.rows():  # of a run that goes on, the policy is known to act
-        options["first"] = FirstTrials(len(todo))
+        options["first"] = FirstTrials(len(todo), run.protocol.policy_settings.get("policy_type"))
     try:
         engine = open_engine(run, todo, make_host, config, stop=stop, **options)
     except CallStoppedError:  # before the policy was loaded

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.real_time import DURING_INFERENCE
 from lerobot_roborecover.scenario import Start
+from lerobot_roborecover.utils.options import parse_shard
 from lerobot_roborecover.utils.renamed_fields import move_old_fields
 
 __all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
@@ -109,10 +109,7 @@ class RecoveryOptions:
 
     def shard_of(self) -> tuple[int, int]:
         """(k, n) of `shard`."""
-        match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", self.shard)
-        if not match or not int(match[1]) < int(match[2]):
-            raise OptionError(f"--env.shard={self.shard}: must be k/n with 0 <= k < n, e.g. 0/4")
-        return int(match[1]), int(match[2])
+        return parse_shard(self.shard, "--env.shard")
 
     def trial_log_path(self, output_dir: Path | None) -> Path:
         """Where the trials go.

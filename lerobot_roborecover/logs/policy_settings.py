@@ -11,6 +11,8 @@ UNKNOWN_WEIGHTS = "server_weights"
 """The setting that says that nothing is known of a server's weights."""
 OBJECT = "policy"
 """The setting that holds a policy's identity where the user gave it another name."""
+CALLABLE = "callable"
+"""Policy type of a Python callable."""
 _VOUCHED = (OBJECT, UNKNOWN_WEIGHTS, "server", "device")
 """Settings that may differ between the runs of one method."""
 

@@ -24,7 +24,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.policy_settings import OBJECT
+from lerobot_roborecover.logs.policy_settings import CALLABLE, OBJECT
 from lerobot_roborecover.policies.action_checks import type_problem
 from lerobot_roborecover.policies.callable_identity import UnhashableError, callable_hash
 from lerobot_roborecover.policies.metadata import PolicyMetadata
@@ -32,7 +32,6 @@ from lerobot_roborecover.policies.runner import Chunk, PolicyError
 
 logger = logging.getLogger(__name__)
 
-POLICY_TYPE = "callable"
 type PolicyFunction = Callable[[dict[str, Any], str], Any]
 """Takes a raw observation (arrays without a batch dimension) and the instruction; returns (A,) or (n, A)."""
 
@@ -86,16 +85,16 @@ def callable_metadata(policy: Callable[..., Any], name: str, **others: Any) -> P
     if keeps_history(policy):
         policy.reset()  # ty: ignore[missing-attribute] - an earlier trial's history is no part of the policy
     try:
-        identity = f"{POLICY_TYPE}@{callable_hash(policy)[:12]}"
+        identity = f"{CALLABLE}@{callable_hash(policy)[:12]}"
     except UnhashableError as err:
-        identity = f"{POLICY_TYPE}@run-{secrets.token_hex(6)}"
+        identity = f"{CALLABLE}@run-{secrets.token_hex(6)}"
         logger.warning(
             "policy %s cannot be identified (%s): its rows are not reused by a later run",
             name,
             err,
         )
-    settings = {"policy_type": POLICY_TYPE, OBJECT: identity}
-    return PolicyMetadata(policy=name, policy_type=POLICY_TYPE, policy_settings=settings, **others)
+    settings = {"policy_type": CALLABLE, OBJECT: identity}
+    return PolicyMetadata(policy=name, policy_type=CALLABLE, policy_settings=settings, **others)
 
 
 @dataclass

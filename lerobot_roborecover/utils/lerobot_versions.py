@@ -15,7 +15,7 @@ from packaging.version import Version
 OLDEST = "0.6.1"
 """The oldest LeRobot that this package runs with, and the one that its tests run with (`constraints.txt`)."""
 TESTED = (OLDEST, "0.6.2 (main, 23 August 2026)")
-"""What tests were run with; docs/lerobot_main.md says which tests."""
+"""What tests were run with; docs/install.md says which tests."""
 
 
 def version_problem(found: str | None) -> str | None:

@@ -10,6 +10,7 @@ import ast
 import dataclasses
 import inspect
 import json
+import re
 import sys
 import types
 import typing
@@ -88,6 +89,22 @@ def option(
 def internal(default: Any = MISSING, *, factory: Any = MISSING) -> Any:
     """A field that Python alone sets: no option of the command."""
     return option(default, factory=factory, internal=True)
+
+
+def parse_shard(text: str, name: str) -> tuple[int, int]:
+    """Returns k and n of `k/n`.
+
+    Args:
+        text: as it is written.
+        name: of the option, for messages.
+
+    Raises:
+        OptionError: it is no part, counted from 0.
+    """
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if not match or not int(match[1]) < int(match[2]):
+        raise OptionError(f"{name}={text}: must be k/n with 0 <= k < n, e.g. 0/4")
+    return int(match[1]), int(match[2])
 
 
 def json_object(name: str, what: str) -> Callable[[str], dict[str, Any]]:

@@ -120,3 +120,14 @@ def test_the_readme_has_the_commands_that_need_nothing_set_up(command):
     begins = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert any(line.split(" ")[0] == command for line in begins)
     assert os.access(ROOT / command, os.X_OK)
+
+
+def test_pages_that_the_code_names_are_there():
+    files = [
+        f for folder in ("lerobot_roborecover", "recipes", "scripts") for f in (ROOT / folder).rglob("*.py")
+    ]
+    named = {
+        (f, page) for f in files for page in re.findall(r"\bdocs/[\w/]+\.md", f.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 20
+    assert [(str(f), page) for f, page in named if not (ROOT / page).is_file()] == []

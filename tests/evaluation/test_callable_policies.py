@@ -158,6 +158,13 @@ def test_without_a_hash_rows_are_never_reused(dataset, tmp_path, caplog):
     assert first.key() != second.key()
 
 
+def test_an_unknown_env_option_is_refused_with_the_nearest(dataset):
+    with pytest.raises(OptionError, match="there is no option 'obs_typ'; the nearest is 'obs_type'"):
+        roborecover.evaluate(
+            lambda observation, instruction: [0.0, 0.0], dataset, name="still", env={"obs_typ": "state"}
+        )
+
+
 def test_a_run_whose_first_trials_fail_alike_stops_and_leaves_no_rows(dataset, tmp_path):
     working = [False]
 
@@ -168,7 +175,8 @@ def test_a_run_whose_first_trials_fail_alike_stops_and_leaves_no_rows(dataset, t
 
     log = tmp_path / "trials.jsonl"
     with pytest.raises(
-        PolicyFailedError, match=r"first 3 trials .* KeyError: 'observation.state'.*check policy"
+        PolicyFailedError,
+        match=r"first 3 trials .* KeyError: 'observation.state'.*what a callable is given",
     ):
         roborecover.evaluate(act, dataset, trials=2, log=log, **QUIET)
     assert read_trial_log(log) == []
