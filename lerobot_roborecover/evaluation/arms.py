@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.evaluation.child import run_program
+from lerobot_roborecover.evaluation.child import run_program, this_module
 from lerobot_roborecover.evaluation.own_log import claim_log
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_write
@@ -72,7 +71,7 @@ class Arm:
             say(plan)
         before, began = self.seconds(), time.monotonic()
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "lerobot_roborecover.cli.main", *self.argv]
+        command = [*this_module("lerobot_roborecover.cli.main"), *self.argv]
         status = run_program(command, self.environment, self.output)
         seconds = before + time.monotonic() - began
         done = {**self._key(), "seconds": seconds, "finished": status == 0}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -18,6 +19,11 @@ _running: set[subprocess.Popen] = set()
 _POLL_S = 0.5
 CANNOT_START = "cannot start "
 """What `startable` begins a line with that names a run and says why it cannot be begun."""
+
+
+def this_module(module: str) -> list[str]:
+    """Beginning of a command that runs a module of the project or of LeRobot."""
+    return [sys.executable, "-m", module]
 
 
 def run_program(
