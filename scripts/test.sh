@@ -28,9 +28,9 @@ check_style_and_types() {
         echo "imports point one way (CONTRIBUTING.md; tool.importlinter in pyproject.toml)" >&2
         exit 1
     }
-    .venv/bin/ty check --quiet --python .venv lerobot_roborecover >/dev/null 2>&1 || {
-        .venv/bin/ty check --python .venv --output-format concise lerobot_roborecover >&2 || true
-        echo "types do not hold: .venv/bin/ty check lerobot_roborecover" >&2
+    .venv/bin/ty check --quiet --python .venv lerobot_roborecover recipes >/dev/null 2>&1 || {
+        .venv/bin/ty check --python .venv --output-format concise lerobot_roborecover recipes >&2 || true
+        echo "types do not hold: .venv/bin/ty check lerobot_roborecover recipes" >&2
         exit 1
     }
 }
