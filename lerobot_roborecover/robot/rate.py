@@ -14,7 +14,7 @@ from lerobot_roborecover.logs.robot import RobotTrial
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.robot.console import Console
-from lerobot_roborecover.robot.run_journal import LOG_FILE
+from lerobot_roborecover.robot.run_journal import LOG_FILE, dataset_folder
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.journal import Journal, read_journal
 from lerobot_roborecover.utils.text import pluralize
@@ -70,7 +70,7 @@ def rate_all(run: Path, rater: str, seed: int, console: Console, say: Callable[[
         raise ScenarioError(
             f"--rater {rater!r:.40} gave this run's first verdicts; a second rater is another"
         )
-    episodes = Episodes(run / f"rollout_{run.name}")
+    episodes = Episodes(dataset_folder(run))
     with Journal(run / FOLDER / f"{check_name(rater)}.jsonl", SCHEMA) as journal:
         done = {record["episode"] for record in journal.records}
         order = np.random.default_rng([seed, len(rater)]).permutation(len(rows))

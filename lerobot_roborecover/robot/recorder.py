@@ -3,7 +3,7 @@
 LeRobot closes a dataset's files at the end of a session; what a crash interrupts is lost. Here the files are
 closed after every episode and the dataset is resumed for the next one. Beside LeRobot's own files,
 `meta/roborecover/` says whose robot it was (`robot.json`) and where people have marked that something went
-wrong (`marks.jsonl`).
+wrong (`marks.jsonl`). A run's dataset says of each frame how its trial ended (`trial_columns`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.robot.connection import calibration_sha256, joint_names, joint_units
+from lerobot_roborecover.robot.trial_columns import write_columns
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.journal import append_records, plain_records
@@ -91,14 +92,25 @@ class Recorder:
         robot: connected.
         features: LeRobot's features of observation and action.
         fps: frames a second.
+        columns: further features, whose values `begin` takes.
 
     Raises:
         ScenarioError: the folder holds the episodes of another robot or of another rate.
     """
 
-    def __init__(self, root: Path, name: str, robot: Any, features: Mapping[str, Any], fps: float):
+    def __init__(
+        self,
+        root: Path,
+        name: str,
+        robot: Any,
+        features: Mapping[str, Any],
+        fps: float,
+        columns: Mapping[str, Any] | None = None,
+    ):
         self.root, self._name, self._robot, self._fps = root, name, robot, round(fps)
-        self._features = {**features, INTERVENTION: {"dtype": "bool", "shape": (1,), "names": None}}
+        intervention = {"dtype": "bool", "shape": (1,), "names": None}
+        self._features = {**features, INTERVENTION: intervention, **(columns or {})}
+        self._values: Mapping[str, Any] = {}
         self._notes = notes_of(robot, fps)
         self._dataset: Any = None
         self._truth: list[dict[str, Any]] = []
@@ -123,9 +135,14 @@ class Recorder:
         path = self.root / "meta" / "info.json"
         return int(json.loads(path.read_text("utf-8"))["total_episodes"]) if path.is_file() else 0
 
-    def begin(self) -> None:
-        """Begins an episode; files are opened with its first frame, so that an empty one leaves none."""
+    def begin(self, values: Mapping[str, Any] | None = None) -> None:
+        """Begins an episode; files are opened with its first frame, so that an empty one leaves none.
+
+        Args:
+            values: of the further columns, the same in all frames.
+        """
         self._frames, self._truth, self._seen = 0, [], None
+        self._values = values or {}
 
     def observed(self) -> None:
         """Keeps the simulated lab's own state for the frame whose observation was just taken: once the action
@@ -158,7 +175,9 @@ class Recorder:
         """Adds a frame: observation and the action that followed it."""
         if self._dataset is None:
             self._open()
-        self._dataset.add_frame({**frame, INTERVENTION: np.array([intervention]), "task": task})
+        known = self._dataset.meta.features  # a dataset of an earlier version lacks columns
+        values = {n: _as_feature(v) for n, v in self._values.items() if n in known}
+        self._dataset.add_frame({**frame, **values, INTERVENTION: np.array([intervention]), "task": task})
         if self._seen is not None:
             self._truth.append(self._seen)
         self._frames += 1
@@ -175,6 +194,8 @@ class Recorder:
         self._dataset.save_episode()
         self._dataset.finalize()
         self._dataset = None
+        if self._values:
+            write_columns(self.root, {number: self._values})
         if self._truth:
             append_records(self.root / FOLDER / TRUTH_FILE, {"episode": number, "frames": self._truth})
         return number
@@ -182,3 +203,8 @@ class Recorder:
     def mark(self, episode: int, frame: int, by: str) -> None:
         """Notes that something went wrong at a frame."""
         append_records(self.root / FOLDER / MARKS_FILE, {"episode": episode, "frame": frame, "by": by})
+
+
+def _as_feature(value: Any) -> Any:
+    """A value as LeRobot records it; NaN is set only after the dataset's statistics are made."""
+    return value if isinstance(value, str) else np.array([np.nan_to_num(value)], np.float32)

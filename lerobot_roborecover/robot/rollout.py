@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,16 +51,23 @@ class RecordedRollout(RolloutStrategy):
         limit_s: time limit.
         instruction: of the task.
         teleop: a connected LeRobot teleoperator for takeovers, or None.
+        columns: values of the recorder's further columns.
     """
 
     def __init__(
-        self, recorder: Recorder, console: Console, limit_s: float, instruction: str, teleop: Any = None
+        self,
+        recorder: Recorder,
+        console: Console,
+        limit_s: float,
+        instruction: str,
+        teleop: Any = None,
+        columns: Mapping[str, Any] | None = None,
     ):
         super().__init__(BaseStrategyConfig())
         self._engine: Any = None
         self._interpolator: Any = None
         self._recorder, self._console, self._limit_s = recorder, console, limit_s
-        self._instruction, self._teleop = instruction, teleop
+        self._instruction, self._teleop, self._columns = instruction, teleop, columns
         self._same: dict[str, tuple[int, float]] = {}
         self.end = RolloutEnd()
 
@@ -71,7 +79,7 @@ class RecordedRollout(RolloutStrategy):
     def run(self, ctx: Any) -> None:
         """Runs the loop; `end` says how it ended. What was recorded is kept, whatever happens."""
         digest = hashlib.sha256()
-        self._recorder.begin()
+        self._recorder.begin(self._columns)
         try:
             self._loop(ctx, digest)
         except RobotLostError as err:

@@ -19,7 +19,8 @@ from lerobot_roborecover.robot.plan import LockedPlan, PlannedPolicy, PlannedTri
 from lerobot_roborecover.robot.points import PointSet, RobotPoint
 from lerobot_roborecover.robot.recorder import Recorder
 from lerobot_roborecover.robot.restore import restore
-from lerobot_roborecover.robot.run_journal import RunJournal
+from lerobot_roborecover.robot.run_journal import RunJournal, dataset_folder
+from lerobot_roborecover.robot.trial_columns import COLUMNS, trial_values
 from lerobot_roborecover.scenario import Outcome, Start
 from lerobot_roborecover.utils.text import pluralize
 
@@ -203,8 +204,10 @@ class RobotRun:
         context = self._context(trial.policy)
         set_instruction(context, point.scenario.task.instruction)
         recorder = self._recorder_of(context, point.fps)
+        start = values["start_error"]
+        columns = trial_values(trial.policy, point.id, StartError.of_json(start) if start else None)
         rollout = RecordedRollout(
-            recorder, self.console, point.time_limit_s, point.scenario.task.instruction, self.teleop
+            recorder, self.console, point.time_limit_s, point.scenario.task.instruction, self.teleop, columns
         )
         buttons = ("success", "failure", "end", *(("takeover", "handback") if self.teleop else ()))
         self.console.show(
@@ -354,10 +357,8 @@ class RobotRun:
 
     def _recorder_of(self, context: Any, fps: float) -> Recorder:
         if self._recorder is None:
-            name = f"rollout_{self.config.folder.name}"
-            self._recorder = Recorder(
-                self.config.folder / name, name, self.robot, context.data.dataset_features, fps
-            )
+            root, features = dataset_folder(self.config.folder), context.data.dataset_features
+            self._recorder = Recorder(root, root.name, self.robot, features, fps, COLUMNS)
         return self._recorder
 
 

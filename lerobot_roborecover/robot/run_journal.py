@@ -1,7 +1,7 @@
-"""The journal of a run: every event before anything else happens, and the trial log that follows from it.
+"""The journal of a run: every event before anything else happens, and what follows from it.
 
 The journal is the truth. A trial log that lacks a row after a crash, or holds one that was taken back, is put
-right from it when the run is opened again.
+right from it when the run is opened again; so are the verdicts in the run's dataset.
 """
 
 from __future__ import annotations
@@ -13,11 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.robot.trial_columns import verdicts_of, write_columns
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.journal import Journal
 
 JOURNAL_FILE, LOG_FILE = "journal.jsonl", "trials.jsonl"
 SCHEMA = 1
+
+
+def dataset_folder(run: Path) -> Path:
+    """Where a run records its episodes; LeRobot's name of a rollout's dataset."""
+    return run / f"rollout_{run.name}"
 
 
 class RunJournal:
@@ -32,7 +38,7 @@ class RunJournal:
 
     def __init__(self, folder: Path):
         self._journal = Journal(folder / JOURNAL_FILE, SCHEMA)
-        self.log = folder / LOG_FILE
+        self.log, self._dataset = folder / LOG_FILE, dataset_folder(folder)
         self.put_right()
 
     def note(self, kind: str, **values: Any) -> None:
@@ -85,11 +91,13 @@ class RunJournal:
         return {r["external"]: r["order"] for r in records if r["kind"] == "restored" and r.get("external")}
 
     def put_right(self) -> None:
-        """Makes the trial log hold the rows that count, and no others."""
-        text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in self.rows().values())
+        """Makes the trial log and the dataset hold the verdicts that count, and no others."""
+        rows = self.rows()
+        text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows.values())
         before = self.log.read_text("utf-8") if self.log.is_file() else ""
         if text != before:
             atomic_write(self.log, text)
+        write_columns(self._dataset, verdicts_of(self._journal.records, rows))
 
     def close(self) -> None:
         self._journal.close()

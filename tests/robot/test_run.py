@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 
 import pytest
@@ -14,7 +15,8 @@ from lerobot_roborecover.robot.connection import RobotError
 from lerobot_roborecover.robot.console import Answer, Console
 from lerobot_roborecover.robot.plan import lock_plan, parse_plan
 from lerobot_roborecover.robot.recorder import marks
-from lerobot_roborecover.robot.run_journal import RunJournal
+from lerobot_roborecover.robot.run_journal import RunJournal, dataset_folder
+from lerobot_roborecover.robot.trial_columns import COLUMNS, write_columns
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.robot_lab import lab, scripted
 
@@ -91,6 +93,22 @@ class Spoken:
         return self.operator.answer(screen, details)
 
 
+def said_by_dataset(folder):
+    """The trial columns of each episode, which are the same in all its frames."""
+    from lerobot.datasets import LeRobotDataset
+
+    found = LeRobotDataset("local/run", root=dataset_folder(folder))
+    rows = found.hf_dataset.with_format(None)
+    episodes = [
+        [rows[i] for i in range(len(rows)) if rows[i]["episode_index"] == e]
+        for e in range(len(found.meta.episodes))
+    ]
+    for episode in episodes:
+        assert len({repr([row[name] for name in COLUMNS]) for row in episode}) == 1
+    assert found[0]["observation.images.top"].ndim == 3
+    return [episode[0] for episode in episodes]
+
+
 def test_a_plan_is_run_blind_and_resumed_and_its_log_is_a_study(made, tmp_path):
     from lerobot_roborecover.analysis.analyse import analyse
     from lerobot_roborecover.analysis.logs import read_study
@@ -120,6 +138,15 @@ def test_a_plan_is_run_blind_and_resumed_and_its_log_is_a_study(made, tmp_path):
     assert sum(good) > sum(worse)
     results = analyse(read_study([str(tmp_path / "trials.jsonl")]))
     assert len(results.recovery.arms) == 2
+    told = said_by_dataset(tmp_path)
+    for row in rows:
+        trial = RobotTrial.of_json(row.robot)
+        if trial.episode is not None:
+            said = told[trial.episode]
+            assert (said["verdict"], said["rater"], said["reason"]) == (trial.verdict, "kim", row.reason)
+            assert (said["policy"], said["recovery_point"]) == (row.options["policy_name"], row.scenario_id)
+            assert said["start_error.joint"] == pytest.approx(trial.start_error.worst("joint"), abs=1e-5)
+            assert isinstance(said["intervention"], bool)
 
 
 def test_the_labs_record_of_a_point_is_that_of_its_frame(made):
@@ -161,7 +188,7 @@ def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path):
     with lab(made) as robot:
         operator = SimulatedOperator(robot, sd_mm=0.0)
         said = {
-            "running": [Answer("end")],
+            "running": [None, None, Answer("end")],
             "verdict": [Answer("failure"), Answer("invalid", {"reason": "person", "note": "a hand came in"})],
             "next": [Answer("go"), Answer("undo"), Answer("pause")],
         }
@@ -172,6 +199,18 @@ def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path):
     (tmp_path / "trials.jsonl").write_text("")
     RunJournal(tmp_path).close()
     assert read_trial_log(tmp_path / "trials.jsonl") == rows
+    (said,) = said_by_dataset(tmp_path)
+    assert (said["verdict"], said["reason"]) == ("invalid", row.reason)
+    # So is the dataset, where a verdict is missing, was taken back, or a crash cut a file off.
+    write_columns(dataset_folder(tmp_path), {0: {"verdict": "success", "start_error.object_px": math.nan}})
+    (dataset_folder(tmp_path) / "data/chunk-000/file-001.parquet").write_bytes(b"PAR1")
+    journal = RunJournal(tmp_path)
+    journal.undo()
+    journal.close()
+    (dataset_folder(tmp_path) / "data/chunk-000/file-001.parquet").unlink()
+    (said,) = said_by_dataset(tmp_path)
+    assert (said["verdict"], said["reason"]) == ("", "")
+    assert math.isnan(said["start_error.object_px"])
 
 
 def test_after_a_crash_before_the_verdict_only_the_verdict_is_asked(made, tmp_path):
