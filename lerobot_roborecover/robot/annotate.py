@@ -80,7 +80,7 @@ def _recording(episodes: Episodes, episode: int, driver: str) -> Recording:
     steps, name = episodes.steps(episode), _candidate_id(episodes, episode)
     instruction = episodes.instruction(episode)
     found = tuple(
-        Suggestion(m["frame"], "marked while the policy ran", "operator")
+        Suggestion(m["frame"], "marked while the policy ran", str(m["by"]))
         for m in marks(episodes.root)
         if m["episode"] == episode and m["frame"] < steps
     )

@@ -9,6 +9,7 @@ from typing import Any
 from lerobot_roborecover.robot.connection import RobotLostError
 from lerobot_roborecover.robot.console import Console
 from lerobot_roborecover.robot.recorder import Recorder
+from lerobot_roborecover.robot.suggestions import FailureWatch
 from lerobot_roborecover.utils.text import pluralize
 
 
@@ -22,6 +23,7 @@ def capture(
     limit_s: float,
     instruction: str,
     teleop: Any = None,
+    watch: FailureWatch | None = None,
     say: Callable[[str], None] = print,
 ) -> int:
     """Records episodes into a LeRobotDataset.
@@ -35,6 +37,7 @@ def capture(
         limit_s: of each.
         instruction: of the task.
         teleop: a connected teleoperator for takeovers, or None.
+        watch: a detector that suggests moments, or None.
         say: takes lines.
 
     Returns:
@@ -65,7 +68,7 @@ def capture(
             "capturing", "Press Mark the moment that something has gone wrong and lies still.", buttons,
             {"instruction": instruction, "limit_s": limit_s},
         )  # fmt: skip
-        rollout = RecordedRollout(recorder, console, limit_s, instruction, teleop)
+        rollout = RecordedRollout(recorder, console, limit_s, instruction, teleop, watch=watch)
         try:
             rollout.setup(context)
             rollout.run(context)
@@ -76,12 +79,19 @@ def capture(
         if end.episode is not None:
             say(
                 f"episode {end.episode}: {pluralize(end.steps, 'frame')}, "
-                f"{pluralize(len(end.marks), 'mark')}" + (f" at {end.marks}" if end.marks else "")
+                f"{pluralize(len(end.marks), 'mark')}"
+                + (f" at {end.marks}" if end.marks else "")
+                + (f", the detector's alarm at {end.suggested}" if end.suggested is not None else "")
             )
         if end.ended in ("trouble", "policy"):
             raise RobotLostError(f"{end.problem}. Episodes up to here are in {folder}")
         if end.ended == "stop":
             console.ask("stopped", "The robot was stopped. Look at it, then press Go.", ("go",))
             console.release()
+    if watch is not None and watch.mean_s > 1 / fps:
+        say(
+            f"the detector took {1000 * watch.mean_s:.0f} ms a step, and a control step has "
+            f"{1000 / fps:.0f}: the policy ran slower than it would without"
+        )
     console.show("over", f"{pluralize(marked, 'moment')} marked in {folder}.")
     return marked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +26,8 @@ KEYS = {
     "t": "takeover", "h": "handback",
 }  # fmt: skip
 """Button by key of the terminal."""
+NAMED_KEYS = ("space", "enter", "tab", "backspace", "esc", "left", "right", "up", "down")
+"""What LeRobot's listener calls keys that are no character."""
 
 
 @dataclass
@@ -46,6 +48,8 @@ class RobotSession:
     """PEM key of the certificate."""
     limits: dict[str, list[float]] = field(default_factory=dict)
     """Lowest and highest position by joint, narrower than the calibrated ones."""
+    keys: dict[str, str] = field(default_factory=dict)
+    """Button by key of the terminal, beside the usual ones, e.g. `{b: mark}` for a pedal that types a b."""
     operator: str = ""
     """`simulated` has the simulated lab put objects back and judge by itself; empty asks people."""
 
@@ -53,6 +57,12 @@ class RobotSession:
         for name, values in self.limits.items():
             if len(values) != 2 or not all(map(math.isfinite, values)) or values[0] >= values[1]:
                 raise OptionError(f"--limits: {name}: {values} is not a lowest and a highest position")
+        for key, button in self.keys.items():
+            if button not in KEYS.values():
+                raise OptionError(f"--keys: no button {button!r:.40}; there are {', '.join(KEYS.values())}")
+            if len(key) != 1 and key not in NAMED_KEYS:
+                names = ", ".join(NAMED_KEYS)
+                raise OptionError(f"--keys: {key!r:.40} is no key: write one character, or one of {names}")
         if self.operator not in ("", "simulated"):
             raise OptionError(f"--operator={self.operator}: not 'simulated', and not empty")
 
@@ -79,6 +89,9 @@ class CaptureConfig(RobotSession):
     """The robot's observation keys to the policy's."""
     inference: InferenceEngineConfig = field(default_factory=SyncInferenceConfig)
     """LeRobot's inference engine: sync or rtc."""
+    detector: str = ""
+    """A failure detector that suggests moments: a checkpoint, or a kind with options, e.g.
+    `no_progress,steps=60,threshold=0.9`."""
 
 
 @dataclass
@@ -143,7 +156,7 @@ def session(config: RobotSession) -> Generator[Session]:
                 PhoneConfig(config.console_host, config.console_port, config.tls_certificate, config.tls_key),
             )
             stack.callback(phone.close)
-            listener = _keyboard(console)
+            listener = _keyboard(console, config.keys)
             if listener is not None:
                 stack.callback(listener.stop)
         yield Session(robot, console, teleop)
@@ -162,21 +175,24 @@ def _operator(config: RobotSession, robot: Any) -> Any:
     return SimulatedOperator(robot, seed=robot.config.seed)
 
 
-def _keyboard(console: Console) -> Any:
-    """Listens to the terminal's keys, where there is a terminal."""
+def _keyboard(console: Console, keys: Mapping[str, str]) -> Any:
+    """Listens to the terminal's keys, where there is a terminal; a key pressed in another window is none."""
     import sys
+
+    from lerobot.utils.keyboard_input import TerminalKeyListener
 
     if not sys.stdin or not sys.stdin.isatty():
         return None
-    from lerobot.utils.keyboard_input import create_key_listener
-
-    words = ", ".join(f"{key}={button}" for key, button in KEYS.items())
+    known = {**KEYS, **keys}
+    print("keys: " + ", ".join(f"{key}={button}" for key, button in known.items()))
 
     def pressed(name: str) -> None:
-        if name in KEYS:
-            console.press(KEYS[name])
+        if name in known:
+            console.press(known[name])
 
-    return create_key_listener(pressed, controls_help=words)
+    listener = TerminalKeyListener(pressed)
+    listener.start()
+    return listener
 
 
 def policy_arguments(argv: Sequence[str]) -> tuple[str, list[str], list[str]]:
@@ -213,6 +229,7 @@ def run_capture(argv: Sequence[str]) -> int:
     from lerobot_roborecover.policies.command_line import run_with_arguments
     from lerobot_roborecover.robot.capture import capture
     from lerobot_roborecover.robot.policies import load_context
+    from lerobot_roborecover.robot.suggestions import FailureWatch
     from lerobot_roborecover.utils.text import next_command
 
     path, overrides, rest = policy_arguments(argv)
@@ -226,9 +243,11 @@ def run_capture(argv: Sequence[str]) -> int:
                 made.robot, path, fps=config.fps, instruction=instruction, overrides=overrides,
                 rename_map=config.rename_map, inference=config.inference,
             )  # fmt: skip
+            features = context.data.dataset_features
+            watch = FailureWatch(config.detector, features) if config.detector else None
             marked = capture(
                 made.robot, context, config.dataset, made.console, episodes=config.episodes,
-                limit_s=config.limit_s, instruction=instruction, teleop=made.teleop,
+                limit_s=config.limit_s, instruction=instruction, teleop=made.teleop, watch=watch,
             )  # fmt: skip
         if marked:
             print(next_command(["robot", "points", str(config.dataset), "--out", "POINTS"]))

@@ -13,7 +13,7 @@ from lerobot_roborecover.robot.annotate import annotate, voted
 from lerobot_roborecover.robot.episodes import Episodes, PointRequest
 from lerobot_roborecover.robot.options import RobotPointsOptions
 from lerobot_roborecover.robot.points import write_points
-from lerobot_roborecover.robot.recorder import marks
+from lerobot_roborecover.robot.recorder import DETECTOR, marks
 from lerobot_roborecover.scenario import DeviationType, ScenarioError, Stage
 from lerobot_roborecover.utils.text import next_command, pluralize
 
@@ -43,11 +43,14 @@ def make_points(options: RobotPointsOptions, say: Callable[[str], None]) -> int:
         requests = [_parse(text, options) for text in options.at] or [
             _request(m["episode"], m["frame"], options.stage, options.deviation, options)
             for m in marks(options.dataset)
+            if m["by"] != DETECTOR
         ]
     if not requests:
+        suggested = [f"{m['episode']}:{m['frame']}" for m in marks(options.dataset)]
+        hint = f" (a detector suggests {', '.join(suggested[:8])})" if suggested else ""
         raise ScenarioError(
-            f"{options.dataset} has no marks. Name moments with --at EPISODE:FRAME, or capture with "
-            "`roborecover robot capture` and press Mark"
+            f"{options.dataset} has no marks of a person. Name moments with --at EPISODE:FRAME{hint}, or "
+            "capture with `roborecover robot capture` and press Mark"
         )
     made = [episodes.point(request, options.time_limit) for request in requests]
     write_points(options.out, [s for s, _ in made], {s.id: pictures for s, pictures in made})

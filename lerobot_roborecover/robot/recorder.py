@@ -2,8 +2,8 @@
 
 LeRobot closes a dataset's files at the end of a session; what a crash interrupts is lost. Here the files are
 closed after every episode and the dataset is resumed for the next one. Beside LeRobot's own files,
-`meta/roborecover/` says whose robot it was (`robot.json`) and where people have marked that something went
-wrong (`marks.jsonl`). A run's dataset says of each frame how its trial ended (`trial_columns`).
+`meta/roborecover/` says whose robot it was (`robot.json`) and where something was marked that went wrong
+(`marks.jsonl`). A run's dataset says of each frame how its trial ended (`trial_columns`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from lerobot_roborecover.utils.journal import append_records, plain_records
 ROBOT_FILE, MARKS_FILE, TRUTH_FILE = "robot.json", "marks.jsonl", "lab_truth.jsonl"
 INTERVENTION = "intervention"
 SCHEMA_VERSION = 1
+OPERATOR, DETECTOR = "operator", "detector"
+"""Who has marked a moment: a person, or a detector that suggests it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def read_notes(root: Path) -> RobotNotes | None:
 
 
 def marks(root: Path) -> list[dict[str, Any]]:
-    """Where people have marked that something went wrong: `episode`, `frame`, `by`."""
+    """Where something went wrong, as people or a detector have marked it: `episode`, `frame`, `by`."""
     return plain_records(root / FOLDER / MARKS_FILE)
 
 

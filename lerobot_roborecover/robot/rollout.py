@@ -17,7 +17,8 @@ from lerobot.utils.feature_utils import build_dataset_frame
 from lerobot_roborecover.robot.clock import clock_of
 from lerobot_roborecover.robot.connection import RobotLostError, asking, camera_names
 from lerobot_roborecover.robot.console import Console
-from lerobot_roborecover.robot.recorder import Recorder
+from lerobot_roborecover.robot.recorder import DETECTOR, OPERATOR, Recorder
+from lerobot_roborecover.robot.suggestions import FailureWatch
 
 FROZEN_AFTER_S = 1.0
 """A camera that gives the same bytes for this long is frozen; its noise alone changes them otherwise."""
@@ -39,6 +40,8 @@ class RolloutEnd:
     actions_sha256: str = ""
     marks: list[int] = field(default_factory=list)
     """Frames at which a person has marked that something went wrong."""
+    suggested: int | None = None
+    """Frame of the detector's first alarm."""
     clock_jump_s: float = 0.0
 
 
@@ -52,6 +55,7 @@ class RecordedRollout(RolloutStrategy):
         instruction: of the task.
         teleop: a connected LeRobot teleoperator for takeovers, or None.
         columns: values of the recorder's further columns.
+        watch: a detector that suggests a moment, or None.
     """
 
     def __init__(
@@ -62,12 +66,14 @@ class RecordedRollout(RolloutStrategy):
         instruction: str,
         teleop: Any = None,
         columns: Mapping[str, Any] | None = None,
+        watch: FailureWatch | None = None,
     ):
         super().__init__(BaseStrategyConfig())
         self._engine: Any = None
         self._interpolator: Any = None
         self._recorder, self._console, self._limit_s = recorder, console, limit_s
         self._instruction, self._teleop, self._columns = instruction, teleop, columns
+        self._watch = watch
         self._same: dict[str, tuple[int, float]] = {}
         self.end = RolloutEnd()
 
@@ -80,6 +86,8 @@ class RecordedRollout(RolloutStrategy):
         """Runs the loop; `end` says how it ended. What was recorded is kept, whatever happens."""
         digest = hashlib.sha256()
         self._recorder.begin(self._columns)
+        if self._watch is not None:
+            self._watch.begin()
         try:
             self._loop(ctx, digest)
         except RobotLostError as err:
@@ -92,7 +100,9 @@ class RecordedRollout(RolloutStrategy):
             self.end.episode = self._recorder.save()
         if self.end.episode is not None:
             for frame in self.end.marks:
-                self._recorder.mark(self.end.episode, frame, "operator")
+                self._recorder.mark(self.end.episode, frame, OPERATOR)
+            if self.end.suggested is not None:
+                self._recorder.mark(self.end.episode, self.end.suggested, DETECTOR)
 
     def teardown(self, ctx: Any) -> None:
         """Stops the engine; the robot stays connected and where it is."""
@@ -133,6 +143,9 @@ class RecordedRollout(RolloutStrategy):
                     **build_dataset_frame(features, action, prefix=ACTION),
                 }
                 digest.update(np.asarray(frame[ACTION], np.float32).tobytes())
+                if self._watch is not None and self._watch.alarms(frame, self._instruction):
+                    self.end.suggested = len(self._recorder)
+                    self._console.update(notice="The detector has an alarm: has something gone wrong?")
                 self._recorder.add(frame, self._instruction, driving)
                 self.end.steps += 1
                 if driving:

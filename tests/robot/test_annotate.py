@@ -10,6 +10,7 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.annotation.shown import shown, take_vote
 from lerobot_roborecover.curation.annotation.votes import VoteJournal, votes_folder
 from lerobot_roborecover.curation.candidates import read_candidates
+from lerobot_roborecover.robot import make_points
 from lerobot_roborecover.robot.points import read_points
 from tests.support.robot_lab import lab, scripted
 
@@ -32,19 +33,24 @@ def test_votes_of_several_raters_become_points(tmp_path, capsys):
     from lerobot_roborecover.robot.console import Console
     from lerobot_roborecover.robot.lab.operator import SimulatedOperator
     from lerobot_roborecover.robot.policies import load_context
+    from lerobot_roborecover.robot.suggestions import FailureWatch
 
+    lines = []
     with lab(tmp_path) as robot:
         context = load_context(
             robot, scripted(tmp_path / "p", size=48), fps=20, instruction=robot.instruction
         )
+        watch = FailureWatch("elapsed,steps=4,threshold=0.9", context.data.dataset_features)
         capture(
             robot, context, tmp_path / "cube", Console(SimulatedOperator(robot)), episodes=2, limit_s=5.0,
-            instruction=robot.instruction, say=lambda line: None,
+            instruction=robot.instruction, watch=watch, say=lines.append,
         )  # fmt: skip
     folder = tmp_path / "points.candidates"
     write_episodes(tmp_path / "cube", folder)
     candidates = read_candidates(folder)
-    assert [c.suggestions[0].step for c in candidates.candidates] == [11, 11]
+    suggested = [[(s.step, s.by) for s in c.suggestions] for c in candidates.candidates]
+    assert suggested == [[(11, "operator"), (4, "detector")]] * 2
+    assert "1 mark at [11], the detector's alarm at 4" in lines[0]
     assert shown(candidates, 0, 20.0).actions
     first, second = (c.id for c in candidates.candidates)
     for name, step in (("kim", 9), ("lee", 11)):
@@ -67,6 +73,12 @@ def test_votes_of_several_raters_become_points(tmp_path, capsys):
     votes = point.scenario.provenance["annotation"]["votes"]
     assert [v["annotator"] for v in votes] == ["kim", "lee"]
     assert "1 dropped, 1 kept" in capsys.readouterr().out
+    # A detector only suggests; with --at a person takes a suggestion up.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make_points, "marks", lambda root: [{"episode": 0, "frame": 4, "by": "detector"}])
+        assert main([*words, "--quasi-static"]) == 2
+    assert "has no marks of a person" in (line := capsys.readouterr().err)
+    assert "(a detector suggests 0:4)" in line
     # One person who has looked names a moment; who has not is asked to.
     assert main([*words, "--at", "0:10"]) == 2
     assert "--quasi-static: look at each moment first" in capsys.readouterr().err

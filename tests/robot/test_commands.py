@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 
 import pytest
@@ -34,6 +35,9 @@ def test_what_cannot_be_used_is_one_line(tmp_path, capsys, monkeypatch):
     assert "policy 'a': its path is needed" in refused(capsys, "run", *LAB, "--plan=plan.yaml", "--rater=kim")
     limits = "--limits={x.pos: [3, 1]}"
     assert "is not a lowest and a highest position" in refused(capsys, "restore", *LAB, limits)
+    keys = ("--keys={b: mork}", "--keys={f13: mark}")
+    assert "no button 'mork'; there are stop, go" in refused(capsys, "restore", *LAB, keys[0])
+    assert "'f13' is no key: write one character" in refused(capsys, "restore", *LAB, keys[1])
     assert "--operator=robot: not 'simulated'" in refused(capsys, "restore", *LAB[:3], "--operator=robot")
     write_points("points", [made_point("a")], {"a": pictures_of(0)})
     line = refused(capsys, "restore", *LAB, "--points=points")
@@ -64,3 +68,25 @@ def test_policies_of_a_plan_are_checked_before_lerobot_is_imported(tmp_path, cap
     with pytest.raises(OptionError, match="n_action_steps"):
         lock_plan(parse_plan({**content, "points": str(tmp_path / "points")}), tmp_path / "run")
     assert not (tmp_path / "run").exists(), "what was refused is not locked, so that it can be mended"
+
+
+def test_a_pedal_is_a_key_of_the_terminal(monkeypatch, capsys):
+    from lerobot_roborecover.robot.commands import _keyboard
+    from lerobot_roborecover.robot.console import Console
+
+    keyboard, terminal = os.openpty()
+    console = Console()
+    console.show("capturing", "", ("mark", "end"))
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        listener = _keyboard(console, {"b": "mark"})
+        try:
+            os.write(keyboard, b"xb ")
+            while not console.stopped:
+                pass
+        finally:
+            listener.stop()
+            os.close(keyboard)
+    assert console.poll().button == "mark"
+    assert console.poll() is None
+    assert "b=mark" in capsys.readouterr().out

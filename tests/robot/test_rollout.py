@@ -38,13 +38,15 @@ def policy(tmp_path_factory):
     return scripted(tmp_path_factory.mktemp("policies") / "good", size=48)
 
 
-def roll(robot, policy, folder, presses=None, limit_s=3.0, teleop=None):
+def roll(robot, policy, folder, presses=None, limit_s=3.0, teleop=None, detector=""):
     from lerobot_roborecover.robot.policies import load_context
     from lerobot_roborecover.robot.rollout import RecordedRollout
+    from lerobot_roborecover.robot.suggestions import FailureWatch
 
     context = load_context(robot, policy, fps=20, instruction=robot.instruction)
     recorder = Recorder(folder, "rollout_test", robot, context.data.dataset_features, 20)
-    strategy = RecordedRollout(recorder, Console(presses), limit_s, robot.instruction, teleop)
+    watch = FailureWatch(detector, context.data.dataset_features) if detector else None
+    strategy = RecordedRollout(recorder, Console(presses), limit_s, robot.instruction, teleop, watch=watch)
     strategy.setup(context)
     strategy.run(context)
     strategy.teardown(context)
@@ -62,8 +64,12 @@ def test_episodes_are_whole_after_each_rollout_and_the_robot_stays_connected(tmp
         assert first.marks == [10]
         assert first.interventions == [{"kind": "takeover", "step": 20, "by": "person", "steps": 10}]
         assert len(LeRobotDataset("local/rollout_test", root=tmp_path / "d")) == 40
-        second = roll(robot, policy, tmp_path / "d", limit_s=1.0)
+        second = roll(robot, policy, tmp_path / "d", limit_s=1.0, detector="elapsed,steps=10,threshold=0.75")
         assert (second.steps, second.ended, second.episode) == (20, "time", 1)
+        assert (second.marks, second.suggested) == ([], 8)
+        still = "no_progress,steps=5,scale=1000,threshold=0.5"
+        third = roll(robot, policy, tmp_path / "still", limit_s=0.5, detector=still)
+        assert third.suggested == 5
         assert robot.is_connected
     found = LeRobotDataset("local/rollout_test", root=tmp_path / "d")
     assert (found.num_episodes, len(found)) == (2, 60)
@@ -71,7 +77,10 @@ def test_episodes_are_whole_after_each_rollout_and_the_robot_stays_connected(tmp
     assert taken == [20 <= i < 30 for i in range(40)]
     np.testing.assert_allclose(found[25]["action"], [123.0, -50.0])
     assert read_notes(tmp_path / "d").robot_type == "roborecover_lab"
-    assert marks(tmp_path / "d") == [{"episode": 0, "frame": 10, "by": "operator"}]
+    assert marks(tmp_path / "d") == [
+        {"episode": 0, "frame": 10, "by": "operator"},
+        {"episode": 1, "frame": 8, "by": "detector"},
+    ]
     assert len(truths(tmp_path / "d", 1)) == 20
 
 
@@ -137,3 +146,21 @@ def test_a_policy_whose_camera_is_not_there_is_refused_before_anything_moves(tmp
             load_context(robot, policy, fps=20, instruction="push")
         with pytest.raises(OptionError, match="cannot be loaded"):
             load_context(robot, str(tmp_path / "nothing"), fps=20, instruction="push")
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("elapsed", "has no threshold, and would never trigger"),
+        ("oracle", "needs to know the outcome, which no robot knows"),
+        ("state_distance,threshold=1", "has not been fitted"),
+        ("chunk_disagreement,threshold=1", "looks into the policy that acts"),
+        ("no_progress,keys=observation.environment_state,threshold=1", "the robot gives action, observation"),
+    ],
+)
+def test_a_detector_that_cannot_help_on_a_robot_is_one_line(what, words):
+    from lerobot_roborecover.robot.suggestions import FailureWatch
+
+    with pytest.raises(OptionError, match=words) as err:
+        FailureWatch(what, {"observation.state": {}, "action": {}})
+    assert str(err.value).startswith(f"--detector={what}: ")

@@ -103,7 +103,7 @@ async function look() {
       const answer = await fetch("api/state");
       const state = await answer.json();
       if (!answer.ok) throw new Error(state.error);
-      byId("text").textContent = state.stopped ? "STOPPED" : state.text;
+      byId("text").textContent = state.stopped ? "STOPPED" : state.details.notice || state.text;
       if (state.version !== shown) showScreen(state);
       shown = state.version;
       showPictures(state);
