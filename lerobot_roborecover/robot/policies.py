@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.robot.clock import SteppedClock, clock_of
 from lerobot_roborecover.robot.connection import camera_names
 from lerobot_roborecover.utils.plugins import register_plugins
+
+_FIRST_ACTION_S = 300.0
+"""A large model compiles and loads within this."""
 
 
 def load_context(
@@ -38,12 +43,17 @@ def load_context(
     from lerobot.configs import FeatureType, PreTrainedConfig
     from lerobot.rollout.configs import RolloutConfig
     from lerobot.rollout.context import build_rollout_context
-    from lerobot.rollout.inference import SyncInferenceConfig
+    from lerobot.rollout.inference import RTCInferenceConfig, SyncInferenceConfig
 
     from lerobot_roborecover.policies.command_line import process_arguments
     from lerobot_roborecover.robot.config_held_robot import HeldRobotConfig
 
     register_plugins()
+    if isinstance(inference, RTCInferenceConfig) and isinstance(clock_of(robot), SteppedClock):
+        raise OptionError(
+            "--inference.type=rtc: the policy thinks while the robot moves, which takes the wall's time. "
+            "Leave --robot.realtime=false out"
+        )
     renamed = dict(rename_map or {})
     try:
         with process_arguments("roborecover robot", []):
@@ -77,8 +87,6 @@ def load_context(
 def warm_up(context: Any) -> None:
     """Has a policy infer once and throws the action away, so that a trial does not pay for a slow first time.
 
-    An engine in the background (RTC) warms up by itself.
-
     Args:
         context: of the policy; its robot is looked at, and does not move.
 
@@ -91,10 +99,10 @@ def warm_up(context: Any) -> None:
     from lerobot.utils.feature_utils import build_dataset_frame
 
     engine = context.policy.inference
+    observation = context.hardware.robot_wrapper.get_observation()
+    seen = context.processors.robot_observation_processor(observation)
+    engine.reset()
     if isinstance(engine, SyncInferenceEngine):
-        observation = context.hardware.robot_wrapper.get_observation()
-        seen = context.processors.robot_observation_processor(observation)
-        engine.reset()
         try:
             engine.get_action(build_dataset_frame(context.data.dataset_features, seen, prefix=OBS_STR))
         except (RuntimeError, ValueError, KeyError, TypeError) as err:
@@ -102,7 +110,27 @@ def warm_up(context: Any) -> None:
                 "a policy cannot infer on what the robot observes: "
                 f"{type(err).__name__}: {' '.join(str(err).split())[:300]}"
             ) from err
-        engine.reset()
+    else:
+        _warm_up_background(engine, seen)
+    engine.reset()
+
+
+def _warm_up_background(engine: Any, seen: dict[str, Any]) -> None:
+    """Waits for the first action of an engine that infers in a thread of its own (RTC)."""
+    engine.start()
+    try:
+        engine.notify_observation(seen)
+        engine.resume()
+        begun = time.monotonic()
+        while engine.get_action(None) is None:
+            if engine.failed or time.monotonic() - begun > _FIRST_ACTION_S:
+                raise OptionError(
+                    f"a policy gave no action within {time.monotonic() - begun:.0f} s on what the robot "
+                    "observes; LeRobot's lines above say why. Try it with --inference.type=sync"
+                )
+            time.sleep(0.01)
+    finally:
+        engine.stop()
 
 
 def set_instruction(context: Any, instruction: str) -> None:

@@ -124,6 +124,10 @@ class RecordedRollout(RolloutStrategy):
             driving, over = self._heard(driving)
             if over:
                 return
+            if self._engine.failed:
+                self.end.ended = "policy"
+                self.end.problem = "the policy failed in its own thread (RTC); LeRobot's lines above say why"
+                return
             observation = robot.get_observation()
             self._recorder.observed()
             if problem := self._frozen(robot, observation, tick):

@@ -224,6 +224,8 @@ class RobotRun:
             rollout.teardown(context)
         jump = (time.time() - wall) - (time.monotonic() - steady)
         end = rollout.end
+        if context.policy.inference.failed:
+            del self._contexts[trial.policy]  # LeRobot's engine stays failed; the next trial gets another
         record = {
             **values,
             "steps": min(end.steps, point.scenario.task.horizon),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import ssl
+import subprocess
 import threading
 
 import httpx
@@ -93,6 +96,36 @@ def test_a_taken_port_is_one_line(served):
     port = int(phone.address.split(":")[2].split("/")[0])
     with pytest.raises(ScenarioError, match="Name another port, or 0 for a free one"):
         Phone(Console(), PhoneConfig(port=port))
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_a_certificate_makes_it_https(tmp_path):
+    words = (
+        "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=lab "
+        "-addext subjectAltName=IP:127.0.0.1 -keyout key.pem -out certificate.pem"
+    )
+    subprocess.run(words.split(), cwd=tmp_path, check=True, capture_output=True)
+    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    phone = Phone(Console(), PhoneConfig("127.0.0.1", 0, certificate, key), lambda line: None)
+    try:
+        assert phone.address.startswith("https://")
+        trusted = ssl.create_default_context(cafile=str(certificate))
+        with httpx.Client(base_url=phone.address, verify=trusted) as user:
+            answer = user.post(
+                "api/enter", json={"code": phone.door.code}, headers={"Origin": phone.address[:-9]}
+            )
+            assert "Secure" in answer.headers["set-cookie"]
+            assert user.post("api/press", json={"button": "stop"}).status_code == 200
+        with pytest.raises(httpx.ConnectError, match="self-signed"):
+            httpx.get(phone.address)
+        with pytest.raises(httpx.HTTPError):
+            httpx.get(phone.address.replace("https", "http"))
+    finally:
+        phone.close()
+    for pair in ((tmp_path / "none.pem", key), (certificate, tmp_path / "none.pem"), (key, key), (None, key)):
+        with pytest.raises(ScenarioError, match="--tls_certificate") as err:
+            Phone(Console(), PhoneConfig("127.0.0.1", 0, *pair), lambda line: None)
+        assert "\n" not in str(err.value)
 
 
 @pytest.mark.browser

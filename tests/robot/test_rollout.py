@@ -164,3 +164,61 @@ def test_a_detector_that_cannot_help_on_a_robot_is_one_line(what, words):
     with pytest.raises(OptionError, match=words) as err:
         FailureWatch(what, {"observation.state": {}, "action": {}})
     assert str(err.value).startswith(f"--detector={what}: ")
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+def test_real_time_chunking_on_the_lab(tmp_path, monkeypatch):
+    """SmolVLA, small and random, infers in LeRobot's own thread while the robot moves."""
+    from huggingface_hub import constants
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+    from lerobot.rollout.inference import RTCInferenceConfig
+
+    from lerobot_roborecover.robot.policies import load_context, warm_up
+    from lerobot_roborecover.robot.rollout import RecordedRollout
+    from tests.support.small_families import save_family
+    from tests.support.small_hub import make_hub
+
+    cache = make_hub(tmp_path / "hub")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
+    images = ("observation.images.top", "observation.images.wrist")
+    vla = str(save_family(tmp_path / "vla", "smolvla", cache, state=2, action=2, images=images))
+    rtc = RTCInferenceConfig(queue_threshold=3)
+    rtc.rtc.execution_horizon = 3
+    with lab(tmp_path) as robot, pytest.raises(OptionError, match="takes the wall's time"):
+        load_context(robot, vla, fps=20, instruction="push", inference=rtc)
+    with lab(tmp_path, realtime=True) as robot:
+        context = load_context(robot, vla, fps=10, instruction="push the puck", inference=rtc)
+        warm_up(context)
+        recorder = Recorder(tmp_path / "d", "rollout_rtc", robot, context.data.dataset_features, 10)
+        buttons = Presses(takeover=8, handback=14)
+        rollout = RecordedRollout(recorder, Console(buttons), 3.0, "push the puck", Still())
+
+        def roll():
+            rollout.setup(context)
+            rollout.run(context)
+            rollout.teardown(context)
+            return rollout.end
+
+        end = roll()
+        assert (end.ended, end.episode) == ("time", 0)
+        assert 10 <= end.steps <= 30
+        assert end.interventions[0]["steps"] == 6
+        data = LeRobotDataset("local/rollout_rtc", root=tmp_path / "d")
+        actions = data.hf_dataset.with_format("numpy")["action"]
+        assert len(actions) == end.steps
+        assert len({tuple(a) for a in np.asarray(actions).tolist()}) > 5
+        assert roll().episode == 1, "the engine is used again"
+
+        def fails(self, *args, **kwargs):
+            raise RuntimeError("shapes do not match")
+
+        monkeypatch.setattr(SmolVLAPolicy, "predict_action_chunk", fails)
+        monkeypatch.setattr("lerobot.rollout.inference.rtc._RTC_ERROR_RETRY_DELAY_S", 0.01)
+        end = roll()
+        assert (end.ended, end.steps) == ("policy", 0)
+        assert "the policy failed in its own thread (RTC)" in end.problem
+        again = load_context(robot, vla, fps=10, instruction="push the puck", inference=rtc)
+        with pytest.raises(OptionError, match="gave no action within"):
+            warm_up(again)

@@ -11,6 +11,7 @@ import hmac
 import io
 import secrets
 import socket
+import ssl
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -193,6 +194,7 @@ class Phone:
     """
 
     def __init__(self, console: Console, config: PhoneConfig, say: Callable[[str], None] = print):
+        _check_pair(config.tls_certificate, config.tls_key)
         self._listener = _listen(config.host, config.port)
         port = self._listener.getsockname()[1]
         scheme = "https" if config.tls_certificate else "http"
@@ -208,13 +210,9 @@ class Phone:
         app = make_app(console, self.door, hosts, scheme)
         self._server = make_server(app)
         if config.tls_certificate:
-            try:
-                self._server.config.ssl_certfile = str(config.tls_certificate)
-                self._server.config.ssl_keyfile = str(config.tls_key) if config.tls_key else None
-                self._server.config.load()
-            except (OSError, ValueError) as err:
-                self._listener.close()
-                raise ScenarioError(f"--tls_certificate={config.tls_certificate}: {err}") from None
+            self._server.config.ssl_certfile = str(config.tls_certificate)
+            self._server.config.ssl_keyfile = str(config.tls_key)
+            self._server.config.load()
         self._thread = threading.Thread(
             target=self._server.run, kwargs={"sockets": [self._listener]}, daemon=True
         )
@@ -234,6 +232,20 @@ def _jpeg(pair: tuple[np.ndarray, np.ndarray], view: str) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(ghost(*pair, view)).save(buffer, "JPEG", quality=90)
     return buffer.getvalue()
+
+
+def _check_pair(certificate: Path | None, key: Path | None) -> None:
+    """Refuses what is no certificate with its key, before anything is served."""
+    if certificate is None and key is None:
+        return
+    if certificate is None or key is None:
+        raise ScenarioError("--tls_certificate, --tls_key: https takes both, a certificate and its key")
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except (OSError, ValueError) as err:
+        raise ScenarioError(
+            f"--tls_certificate={certificate}, --tls_key={key}: no certificate and its key in PEM ({err})"
+        ) from None
 
 
 def _listen(host: str, port: int) -> socket.socket:
