@@ -15,9 +15,9 @@ from pathlib import Path
 
 IMPORTED = (
     "lerobot_roborecover",  # before numpy: it pins how simulators round
-    "pytest", "numpy", "pyarrow", "pyarrow.parquet", "gymnasium", "httpx", "httpcore", "anyio", "yaml",
-    "tqdm", "filelock", "jinja2", "PIL.Image", "PIL.ImageDraw", "lerobot_roborecover.cli.main",
-    "lerobot_roborecover.datasets",
+    "pytest", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet", "pandas", "scipy.stats", "gymnasium",
+    "httpx", "httpcore", "anyio", "yaml", "tqdm", "filelock", "jinja2", "PIL.Image", "PIL.ImageDraw",
+    "lerobot_roborecover.cli.main", "lerobot_roborecover.datasets",
 )  # fmt: skip
 """What every program finds imported. Not `huggingface_hub`, which reads its settings when it is imported."""
 
