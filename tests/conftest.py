@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import logging
 import os
@@ -21,6 +22,15 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 # No example is expected within a time: other work on the machine makes anything slow.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
+
+
+@pytest.fixture(autouse=True)
+def draccus_reads_a_docstring_once():
+    """Draccus looks for the help of each of some 900 options in their source at each parse; a process of tests
+    parses a hundred times."""
+    module = sys.modules.get("draccus.wrappers.docstring")
+    if module is not None and not hasattr(module.get_attribute_docstring, "cache_info"):
+        module.get_attribute_docstring = functools.cache(module.get_attribute_docstring)
 
 
 @pytest.fixture(autouse=True)
