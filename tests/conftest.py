@@ -26,8 +26,7 @@ settings.load_profile("patient")
 
 @pytest.fixture(autouse=True)
 def draccus_reads_a_docstring_once():
-    """Draccus looks for the help of each of some 900 options in their source at each parse; a process of tests
-    parses a hundred times."""
+    """Draccus reads the help of some 900 options from source at each parse; tests parse hundreds of times."""
     module = sys.modules.get("draccus.wrappers.docstring")
     if module is not None and not hasattr(module.get_attribute_docstring, "cache_info"):
         module.get_attribute_docstring = functools.cache(module.get_attribute_docstring)

@@ -91,6 +91,7 @@ def test_a_worker_needs_neither_lerobot_nor_torch():
     assert not modules_after(code) & set(HEAVY)
 
 
+@pytest.mark.slow
 def test_a_running_metaworld_worker_loads_neither_lerobot_nor_torch():
     code = (
         "from lerobot_roborecover.workers.slot_server import SlotServer\n"

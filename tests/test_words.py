@@ -6,6 +6,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "lerobot_roborecover"
 WORDS = re.compile(
@@ -24,6 +26,7 @@ EARLIER = {"portable"}
 """Fields that take an earlier option's value."""
 
 
+@pytest.mark.slow
 def test_docstrings_name_what_they_speak_of():
     found = []
     for file in sorted(PACKAGE.rglob("*.py")):
@@ -47,6 +50,7 @@ def test_pages_name_what_they_speak_of():
     assert not found, "\n".join(found)
 
 
+@pytest.mark.slow
 def test_code_has_the_fields_names():
     found = []
     for file in sorted([*PACKAGE.rglob("*.py"), *(ROOT / "recipes").rglob("*.py")]):

@@ -270,6 +270,7 @@ def coin_flips(count=40, policies=6, trials=5, seed=0, rate=0.5):
     return make_panel([Arm(rows[0].policy, Start.RECOVERY, (0,), tuple(rows)) for rows in arms])
 
 
+@pytest.mark.slow
 def test_six_identical_coins_gain_nothing():
     gains, sources, profiles = [], [], []
     for seed in range(8):

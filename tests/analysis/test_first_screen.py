@@ -51,6 +51,7 @@ def test_the_pair_is_two_that_ended_differently_if_there_are_such(tmp_path):
     assert pair(("nobody", 0)) == ("s000", [("nobody", "trial 1")]), "no row, no outcome"
 
 
+@pytest.mark.slow
 def test_videos_beside_a_log_are_found_and_start_the_report(tmp_path):
     """A folder that the logs of two policies share is not taken, and no video of initial trials."""
     for p in "ab":
@@ -74,6 +75,7 @@ def test_videos_beside_a_log_are_found_and_start_the_report(tmp_path):
     assert page.count("<video") == 2, "b's, on the first screen and on its card"
 
 
+@pytest.mark.slow
 def test_videos_of_interventions_are_in_the_gallery_with_their_outcomes(tmp_path):
     """Of a reversion, whose trials another start names, and of a policy beside which a detector acted."""
     direct = [trial_row(n, success=False, policy="a") for n in range(4)]

@@ -108,6 +108,7 @@ def test_tasks_hold_first_states(tmp_path):
     assert (c.units, c.unit) == (5, "tasks")
 
 
+@pytest.mark.slow
 def test_an_old_log_has_its_first_states_from_the_shipped_set(tmp_path):
     scenarios = list(load_scenarios("metaworld_study", split="test"))
     rows = [

@@ -79,6 +79,7 @@ def test_a_report_takes_no_forks(tmp_path):
         read_study([str(log)])
 
 
+@pytest.mark.slow
 def test_tables_and_page(tmp_path):
     rows = [r for s in range(12) for arm in ("continue", "fresh", "rollback:30") for step in (0, 25)
             for r in [fork(s, arm, (s + step + len(arm)) % 3 > 0, step=step)]]  # fmt: skip

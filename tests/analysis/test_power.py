@@ -70,6 +70,7 @@ def pilot(tmp_path, *policies, count=400, trials=4):
     return logs, make_panel(read_study(logs).arms)
 
 
+@pytest.mark.slow
 def test_a_pilot_gives_rate_scatter_and_correlation_and_never_the_difference(tmp_path):
     # The same seed: the same scenarios are hard for both, clipped to [.02, .98].
     _, panel = pilot(tmp_path, ("a", 0.5, 1))

@@ -57,6 +57,7 @@ def written(tmp_path_factory):
     return results, write_report(results, root / "out"), root / "out"
 
 
+@pytest.mark.slow
 def test_everything_is_written(written):
     _, files, out = written
     names = {t.name for t in files.tables}
@@ -241,6 +242,7 @@ def test_all_successes_and_all_failures(tmp_path, success):
     assert "nan" not in re.sub(r"base64,[\w+/=]*", "", files.html.read_text()).lower()
 
 
+@pytest.mark.slow
 def test_a_single_scenario(tmp_path):
     results = results_of(tmp_path, [trial_row(0, k, k < 2) for k in range(5)])
     write_report(results, tmp_path / "out")
@@ -251,6 +253,7 @@ def test_a_single_scenario(tmp_path):
     assert headline(results) == "alpha@1 recovers in 40.0 % of its trials, averaged over scenarios."
 
 
+@pytest.mark.slow
 def test_no_valid_trial(tmp_path):
     results = results_of(tmp_path, [trial_row(n, outcome="sim_error") for n in range(3)])
     write_report(results, tmp_path / "out")
@@ -319,6 +322,7 @@ def test_interventions_are_kept_out_of_the_comparison(tmp_path):
         results_of(tmp_path, direct, Options(baseline="nobody"))
 
 
+@pytest.mark.slow
 def test_markup_in_a_log_stays_text(tmp_path):
     bad = "<script>alert(1)</script> & | _$"
     results = results_of(tmp_path, [trial_row(n, policy=bad, instruction=bad, reason=bad) for n in range(2)])
@@ -356,6 +360,7 @@ def test_cards_are_sorted_by_disagreement(tmp_path):
     assert cards[0].frame.startswith("data:image/png;base64,")
 
 
+@pytest.mark.slow
 def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     """Rows as the vector env writes them, the set that was run, a video and a wrong set."""
     data = fake_dataset(tmp_path / "set", 6)
@@ -393,6 +398,7 @@ def test_reading_logs_needs_no_simulator_and_no_lerobot(tmp_path):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_a_report_leaves_the_garbage_collector_as_it_was(tmp_path):
     """It is called from training loops, too: what is garbage then must not stay for ever."""
     log = write_log(tmp_path / "log.jsonl", policy_rows("p", 8, 1, 0.5, 0))

@@ -53,6 +53,7 @@ def test_separated_or_constant_data_have_no_slope():
     assert np.isnan(verdict_slope(same, "object_px").value)
 
 
+@pytest.mark.slow
 def test_a_report_of_robots_shows_how_far_off_the_starts_were(tmp_path):
     rows = rows_of("act@1", 2.0, -1.5) + rows_of("pi@2", 3.0, -1.5, seed=1)
     refused = robot_row(0, 9, False, 8.0, policy="act@1", outcome="state_mismatch", reason="objects are off")

@@ -150,6 +150,7 @@ def test_a_folder_in_the_place_of_a_file_is_one_line(logs, tmp_path, capsys):
     assert f"{tmp_path}/file" in one_line(capsys)
 
 
+@pytest.mark.slow
 def test_text_is_printed_in_an_encoding_that_lacks_it(logs, tmp_path, monkeypatch):
     streams = [io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2)]
     monkeypatch.setattr("sys.stdout", streams[0])

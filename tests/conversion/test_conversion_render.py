@@ -63,6 +63,7 @@ def test_an_unforeseen_error_of_a_simulator_is_one_result_too(tmp_path):
     assert [r.error for r in found] == ["", "IndexError: contact buffer", ""]
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_and_repeats_only_what_failed(tmp_path):
     scenarios, log = [bare(i) for i in range(6)], tmp_path / "log"
     fingerprint_scenarios(scenarios[:4], log, check=refuse_odd_seeds)
@@ -122,6 +123,7 @@ def process_and_simulator():
     return os.getpid(), id(simulator_of_worker())
 
 
+@pytest.mark.slow
 def test_one_process_and_one_simulator_serve_every_step(tmp_path):
     """Each would compile the task anew: six seconds of CPU on LIBERO, three times a conversion."""
     scenarios = [bare(i) for i in range(3)]
@@ -145,6 +147,7 @@ def has_imported(name):
     return name in sys.modules
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_a_refusal_that_says_what_to_do():
     with JobPool("fake") as pool, pytest.raises(SimulatorError, match="worker process died"):
         list(pool.run(os._exit, [3]))

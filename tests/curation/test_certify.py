@@ -52,6 +52,7 @@ def certified(tmp_path_factory):
     return root, command, part, statuses
 
 
+@pytest.mark.slow
 def test_parts_add_up_and_a_part_never_replaces_the_whole(certified, capsys):
     root, command, part, statuses = certified
     assert statuses == [0, 1]
@@ -164,6 +165,7 @@ def test_what_speaks_against_a_replay(changes, fault):
     assert not found.unrecorded
 
 
+@pytest.mark.slow
 def test_frames_are_compared_where_the_set_has_some(tmp_path):
     scenarios = [fake_scenario(i, name="push-left") for i in range(2)]
     options = {"obs_type": "pixels_agent_pos", "observation_size": 64}

@@ -267,6 +267,7 @@ def roll(work, made, slots, stop_after=None):
     return ended
 
 
+@pytest.mark.slow
 def test_slots_and_interruption_change_nothing(tmp_path):
     made = units(range(3), perturbed=True)
     roll(tmp_path / "one", made, 1)

@@ -136,6 +136,7 @@ def test_one_trial_of_a_deterministic_policy_stands_for_all(same, noisy):
     assert found.counts["a"].trials == 1
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(data=st.data())
 def test_curtailing_keeps_the_same_scenarios(data):

@@ -61,6 +61,7 @@ def elsewhere(scenario):
     return without_hash(scenario, bodies=there)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -196,6 +196,7 @@ def _work(job: str) -> str:
     return f"{job} {os.getpid()}"
 
 
+@pytest.mark.slow
 def test_what_crashes_or_hangs_is_only_its_own_end():
     with JobPool(workers=3, fresh=True) as pool:
         found = dict(pool.outcomes(_work, iter(["a", "raises", "exits", "b"]), lambda job: (job,)))

@@ -92,6 +92,7 @@ def scenarios(draw, platform="libero", width=7):
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(scenarios(), min_size=1, max_size=4, unique_by=lambda s: s.id))
 def test_round_trip_is_bit_exact(tmp_path, written):

@@ -42,6 +42,7 @@ def named(scenario, name):
     return scenario
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     suite=st.sampled_from(LIBERO_SUITES),

@@ -164,6 +164,7 @@ def frames_bomb(root):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "call"),
     [

@@ -63,6 +63,7 @@ def source(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [divide, replace_set])
 def test_a_kill_at_any_operation_leaves_the_old_or_the_new_set(source, tmp_path, monkeypatch, work):
     kills = tmp_path / "kills"

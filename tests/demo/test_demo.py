@@ -332,6 +332,7 @@ class Page(HTMLParser):
         return [link for link in self.links if link.startswith("data:image/jpeg")]
 
 
+@pytest.mark.slow
 def test_the_page_is_the_report_of_the_log_with_its_pictures(dataset, tmp_path):
     a, b, c, d = (s.id for s in load_scenarios(str(dataset)))
     rows = rows_of(

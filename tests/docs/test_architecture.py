@@ -91,6 +91,7 @@ def test_a_walk_has_as_many_files_as_it_says():
         assert len(files_in(table)) == count
 
 
+@pytest.mark.slow
 def test_functions_and_classes_of_the_page_exist():
     missing = []
     for span in code_spans(PAGE):

@@ -43,6 +43,7 @@ def shell():
         yield step.get("run", "").replace("bash -c '", "\n").replace("eval-artifacts'", "eval-artifacts")
 
 
+@pytest.mark.slow
 def test_every_evaluation_is_one():
     found = [words for code in shell() for words in commands(code, "lerobot-eval")]
     found += [words[1:] for code in shell() for words in commands(code, "roborecover") if words[0] == "eval"]
@@ -121,6 +122,7 @@ def test_the_results_are_those_of_the_studies(study):
         assert float(row[2].split()[0]) == pytest.approx(values["initial_state_success_rate"], abs=rounded)
 
 
+@pytest.mark.slow
 def test_files_made_from_data_are_those_of_today(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     lerobot_benchmark.write_files(tmp_path)

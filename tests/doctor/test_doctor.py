@@ -146,6 +146,7 @@ def test_opengl_names_a_backend_that_works(monkeypatch):
     assert machine.check_opengl().status is Status.FAILURE
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_the_test_render_runs_in_a_process_of_its_own():
     answer = probe.run_probe("doctor.probe_render", timeout_s=PATIENCE_S, environment={"MUJOCO_GL": "egl"})
@@ -250,6 +251,7 @@ def test_version_and_usage(capsys):
     assert exit_.value.code == 2
 
 
+@pytest.mark.slow
 def test_parsing_imports_neither_lerobot_nor_torch():
     code = (
         "import sys; from lerobot_roborecover.cli.main import build_parser; build_parser();"

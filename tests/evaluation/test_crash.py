@@ -102,6 +102,7 @@ def test_kills_lose_nothing(tmp_path, way, count, least):
         assert len(keys) == len(set(keys)) == 8 * TRIALS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["engine", pytest.param("loop", marks=STORM)])
 def test_a_simulator_stuck_in_native_code_ends_with_its_parent(tmp_path, way):
     """It never looks at its socket, so the kernel has to end it."""

@@ -80,6 +80,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 def test_refusals_are_one_line_and_import_neither_lerobot_nor_torch():
     done = subprocess.run(
         [sys.executable, "-c", RUN], input=json.dumps([argv for argv, _ in REFUSALS]),

@@ -80,6 +80,7 @@ def reference(dataset, tmp_path_factory):
     return outcomes(evaluate(dataset, tmp_path_factory.mktemp("r") / "log.jsonl", trials=TRIALS, batch=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slots", "max_batch"), [(1, 64), (2, 1), (4, 2), (5, 64)])
 def test_the_same_rows_as_lerobots_loop(dataset, reference, tmp_path, slots, max_batch):
     host = PushHost(max_batch)
@@ -87,12 +88,14 @@ def test_the_same_rows_as_lerobots_loop(dataset, reference, tmp_path, slots, max
     assert max(host.batches) <= max_batch
 
 
+@pytest.mark.slow
 def test_trials_of_different_scenarios_share_a_batch(dataset, tmp_path):
     host = PushHost()
     run_engine(dataset, tmp_path / "log.jsonl", slots=4, host=host)
     assert max(host.batches) > 1
 
 
+@pytest.mark.slow
 def test_noise_belongs_to_the_trial_not_to_the_batch(dataset, tmp_path):
     one = outcomes(run_engine(dataset, tmp_path / "1.jsonl", slots=1, host=PushHost(noise=0.3)))
     many = outcomes(run_engine(dataset, tmp_path / "4.jsonl", slots=4, host=PushHost(noise=0.3)))
@@ -111,6 +114,7 @@ def test_stopped_and_resumed(dataset, reference, tmp_path_factory, stops):
     assert outcomes(run_engine(dataset, log)) == reference
 
 
+@pytest.mark.slow
 def test_lerobots_loop_resumes_an_engine_run_and_the_other_way_round(dataset, reference, tmp_path):
     left = iter(range(150))
     run_engine(dataset, tmp_path / "a.jsonl", stop=lambda: next(left, None) is None)
@@ -119,6 +123,7 @@ def test_lerobots_loop_resumes_an_engine_run_and_the_other_way_round(dataset, re
     assert outcomes(run_engine(dataset, tmp_path / "b.jsonl")) == reference
 
 
+@pytest.mark.slow
 def test_a_policy_that_raises_costs_the_trial_that_made_it(dataset, reference, tmp_path):
     bad = fake_scenario(3)
     mark = [float(x) for x in bad.fingerprint.bodies["puck"].position_m[:2]]
@@ -131,6 +136,7 @@ def test_a_policy_that_raises_costs_the_trial_that_made_it(dataset, reference, t
     assert others == {k: v for k, v in reference.items() if k[0] != bad.id}
 
 
+@pytest.mark.slow
 def test_a_scenario_that_keeps_breaking_is_parked(tmp_path):
     good, bad = fake_scenario(0), fake_scenario(1, name="exits", suite="faults")
     root = write_scenarios(tmp_path / "set", [good, bad])

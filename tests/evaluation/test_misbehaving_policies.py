@@ -104,6 +104,7 @@ BAD_CHUNKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bad", "realtime"),
     [(bad, False) for bad in BAD_CHUNKS] + [(bad, True) for bad in ("nothing", "one action", "complex")],
@@ -137,6 +138,7 @@ def test_real_numbers_of_any_size_are_executed(dataset, tmp_path, dtype):
     assert {r.outcome for r in rows} <= {"success", "horizon"}
 
 
+@pytest.mark.slow
 def test_a_policy_that_blocks_ends_its_trials_and_the_run(dataset, tmp_path):
     host = BlockingHost(good=5)
     engine, rows = run_engine(dataset, tmp_path / "log.jsonl", host, policy_watchdog_s=5.0)
@@ -208,6 +210,7 @@ HUNG_COMMAND = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hang", "words"), [("wait_for_another_thread", "written"), ("hold_pythons_lock", "Timeout")]
 )
@@ -244,6 +247,7 @@ HUNG_LOOP = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stubborn", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_lerobots_loop_ends_where_the_policy_blocks(dataset, tmp_path, stubborn):
     program = textwrap.dedent(HUNG_LOOP).replace("{stubborn}", str(stubborn))

@@ -180,6 +180,7 @@ def frozen(dataset, tmp_path_factory):
     return engine(dataset, tmp_path_factory.mktemp("frozen") / "log.jsonl")
 
 
+@pytest.mark.slow
 def test_no_latency_is_a_frozen_clock(dataset, frozen, tmp_path):
     for during_inference in ("hold", "chunk"):
         rows = engine(
@@ -197,6 +198,7 @@ def test_no_latency_is_a_frozen_clock(dataset, frozen, tmp_path):
     assert any(r.success for r in frozen)
 
 
+@pytest.mark.slow
 def test_given_latency_is_deterministic_and_the_same_in_both_loops(dataset, frozen, tmp_path):
     options = {"realtime": True, "latency_s": 0.12}
     rows = engine(dataset, tmp_path / "a.jsonl", **options)

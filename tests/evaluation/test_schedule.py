@@ -71,6 +71,7 @@ def test_one_slot_a_core_comes_within_a_tenth_of_its_own_bound(shortest):
     assert world.now < 1.1 * chain
 
 
+@pytest.mark.slow
 def test_more_slots_than_cores_pay_under_a_slow_policy():
     rates = {}
     for slots in (8, 16):
@@ -85,6 +86,7 @@ def test_a_fast_policy_is_not_waited_for():
     assert world.now < 1.1 * (world.core_s / 8 + 12 * CHUNK * 0.010)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fixed_s", "each_s", "limit"), [(0.1, 0.0, 64), (0.07, 0.005, 64), (0.07, 0.005, 16)]
 )

@@ -39,6 +39,7 @@ def reference(dataset, tmp_path_factory):
     return outcomes(rows)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     batch=st.sampled_from([1, 2, 4]),
@@ -56,6 +57,7 @@ def test_batch_order_and_resume_change_nothing(
     assert rows[: len(first)] == first, "finished trials are kept as they were"
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(parts=st.integers(2, 6))
 def test_shards_together_are_the_whole(dataset, reference, tmp_path_factory, parts):
@@ -69,6 +71,7 @@ def test_shards_together_are_the_whole(dataset, reference, tmp_path_factory, par
     assert merged == reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 2])
 def test_worker_processes_change_nothing(dataset, reference, tmp_path, batch):
     rows = evaluate(dataset, tmp_path / "log.jsonl", trials=TRIALS, batch=batch, workers=True)

@@ -98,7 +98,9 @@ def test_a_bowl_on_its_way_to_a_plate(sim):
 @pytest.mark.parametrize(
     ("suite", "words", "kinds", "opening", "away"),
     [
-        ("libero_goal", "open_the_middle_drawer", ["open"], 0, [0, 1, 0]),
+        pytest.param(
+            "libero_goal", "open_the_middle_drawer", ["open"], 0, [0, 1, 0], marks=pytest.mark.nightly
+        ),
         pytest.param("libero_10", "bottom_drawer", ["in", "close"], 1, [0, -1, 0], marks=pytest.mark.nightly),
         pytest.param("libero_10", "microwave", ["in", "close"], 1, None, marks=pytest.mark.nightly),
         pytest.param("libero_goal", "turn_on_the_stove", ["turnon"], 0, None, marks=pytest.mark.nightly),

@@ -108,6 +108,7 @@ def test_libero_s_settle_as_libero_does():
         assert np.array_equal(s.prefix[:10], np.tile([0, 0, 0, 0, 0, 0, -1.0], (10, 1)))
 
 
+@pytest.mark.slow
 def test_libero_s_is_what_is_evaluated_by_default():
     assert PLATFORM.evaluated("", None) == ("libero_recovery", "test")
     assert len(load_scenarios("libero_recovery", split="test")) == 200

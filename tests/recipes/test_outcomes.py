@@ -75,6 +75,7 @@ def test_the_page_on_intervention_timing_says_what_is_stored():
         assert f"| {rescued} / {harmed} |" in row
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["detectors", pytest.param("detectors_recovery", marks=pytest.mark.nightly)])
 def test_the_page_on_detectors_says_what_is_stored(name):
     page = (DOCS / "log" / "detectors.md").read_text(encoding="utf-8")
@@ -88,6 +89,7 @@ def test_the_page_on_detectors_says_what_is_stored(name):
             assert f"| `{detector.name}` | {shown} |" in page
 
 
+@pytest.mark.slow
 def test_the_page_on_training_on_recoveries_says_what_is_stored():
     page = (DOCS / "studies" / "recovery_data.md").read_text(encoding="utf-8")
     rates: dict[str, list[str]] = {}

@@ -87,6 +87,7 @@ def test_bytes_that_are_refused(data, words):
         unpack(data, "the server's answer")
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=60) | st.builds(lambda n: pack(ARRAYS)[:n], st.integers(0, 300)))
 def test_no_bytes_raise_anything_else(data):
@@ -175,6 +176,7 @@ def bad_server(kind):
     return infer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "error", "words"),
     [
@@ -224,6 +226,7 @@ def test_no_server_and_another_server():
         assert "write ws://" in str(answer)
 
 
+@pytest.mark.slow
 def test_an_error_costs_its_request_alone_and_a_lost_connection_none():
     """openpi's server closes the connection after a traceback."""
 

@@ -62,6 +62,7 @@ def test_the_standalone_server_takes_so_many_connections(standalone):  # noqa: F
         client.close()
 
 
+@pytest.mark.slow
 def test_the_standalone_server_keeps_strangers_out(standalone, openpi_client, monkeypatch):  # noqa: F811
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 

@@ -67,6 +67,7 @@ def macros_of(found: Results) -> list[list[str]]:
     return [list(texts) for texts in zip(*columns, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("results", PAGES, indirect=True)
 def test_every_policy_s_row_is_that_of_the_stored_outcomes(results):
     name, found = results

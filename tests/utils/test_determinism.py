@@ -76,6 +76,7 @@ def test_square_roots_in_float64_round_to_the_float32_that_is_right():
     assert core_type(code, **KERNELS) == "0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["build", "missing.yaml"], ["screen", "missing", "--policy", CHECKPOINT, "--out", "out"]]
 )

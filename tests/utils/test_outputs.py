@@ -122,6 +122,7 @@ def test_a_page_that_a_crash_cut_short_is_made_again(tmp_path):
         check_page(tmp_path / "out" / "numbers.json", names)
 
 
+@pytest.mark.slow
 def test_a_plan_replaces_earlier_plans_only(tmp_path, capsys):
     command = ["plan", "--rate", "50", "--trials", "1", "--out", str(tmp_path)]
     assert main(command) == 0

@@ -350,6 +350,7 @@ class Eyes:
         self.socket.send(json.dumps({"type": kind, **values}))
 
 
+@pytest.mark.slow
 def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_path, monkeypatch):
     starts = [first_state("fake", "push-left", seed=s) for s in (3, 4)]
     # The first start takes as long to load as the page takes to come.
@@ -392,6 +393,7 @@ def test_a_start_is_shown_before_it_begins_and_comes_again_when_discarded(tmp_pa
         eyes.socket.close()
 
 
+@pytest.mark.slow
 def test_nobody_drives_blind(tmp_path):
     """Steps wait for pictures that the controller has not shown yet, whatever others have."""
     with cockpit(tmp_path / "r", [first_state("fake", "push-left", seed=3)]) as found:

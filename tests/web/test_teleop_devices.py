@@ -195,6 +195,7 @@ class Mouse:
         self.closed = True
 
 
+@pytest.mark.slow
 def test_a_spacemouse_drives_and_may_be_unplugged(tmp_path):
     away = report(1, 0, -350, 0, 0, 0, 0)
     mice = [Mouse([away, [3, 1, 0], [3, 0, 0]], unplugged=True), Mouse([away, report(1, 0, 0, 0, 0, 0, 0)])]

@@ -50,6 +50,7 @@ def heavy():
     return {"lerobot", "torch"} & set(sys.modules)
 
 
+@pytest.mark.slow
 def test_results_come_in_the_order_of_the_items_and_each_once():
     with JobPool("fake", workers=3) as pool:
         assert list(pool.map_ordered(squared, range(7))) == [n**2 for n in range(7)]
@@ -58,6 +59,7 @@ def test_results_come_in_the_order_of_the_items_and_each_once():
         assert pool.call(heavy) == set()
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_is_that_jobs_own_affair():
     wanted = ["a", "refuses", "breaks", "dies", "b"]
     with JobPool("fake", workers=1) as pool:
@@ -84,6 +86,7 @@ def test_one_process_and_one_simulator_from_job_to_job():
         pool.call(work, "simulator")
 
 
+@pytest.mark.slow
 def test_a_fresh_process_for_each_and_a_limit_for_it():
     with JobPool(workers=1, fresh=True) as pool:
         found = dict(pool.run(work, ["a", "b"]))
