@@ -50,7 +50,7 @@ def report(
     platform: str | None = None,
     title: str = "Recovery report",
     options: Options | None = None,
-    gallery: Gallery | None = None,
+    gallery: Gallery | str | None = None,
     command: str = "",
 ) -> Report:
     """Writes tables with intervals, figures and one HTML page, from trial logs.
@@ -62,7 +62,9 @@ def report(
         platform: take this platform's rows only.
         title: heading.
         options: how intervals are drawn, and which policy is the baseline.
-        gallery: pictures of the scenarios.
+        gallery: the evaluated scenario set (shipped name, folder, Hub id), whose recorded frames are then
+            shown beside each scenario's outcomes; a `Gallery` also takes videos from other folders. Videos
+            beside the logs are shown without it.
         command: what made the report, for its last lines.
 
     Raises:
@@ -71,7 +73,8 @@ def report(
         ScenarioError: the gallery's scenarios cannot be loaded, or are not the logs'.
         OutputExistsError: `out` holds files of a report's names that are of no report.
     """
-    out, gallery = Path(out), gallery or Gallery()
+    out = Path(out)
+    gallery = gallery if isinstance(gallery, Gallery) else Gallery(gallery)
     check_page(out, REPORT_FILES)
     study = read_study(_named(logs), platform)
     with _no_garbage_yet():
@@ -136,8 +139,9 @@ def _pictures(gallery: Gallery, out: Path, results: Results) -> tuple[dict, dict
         folders.append((name, Path(rest)))
     starts = {arm.title: arm.start for arm in study.arms}
     if not folders:
+        rows = {arm.title: arm.rows for arm in study.arms}
         panels = (results.recovery, results.interventions)
         shown = {title for panel in panels if panel is not None for title in panel.arms}
-        folders = [(arm, f) for arm, f in videos_beside(study.files.items(), starts) if arm in shown]
+        folders = [(arm, f) for arm, f in videos_beside(study.files.items(), starts, rows) if arm in shown]
     clips, skipped = find_clips(folders, ids, gallery.videos_mb * 2**20, starts)
     return frames, clips, remarks + skipped

@@ -76,7 +76,8 @@ class EvaluationCallback:
             return {}
         from lerobot_roborecover.evaluation.evaluate import evaluate
 
-        options: dict[str, Any] = {"name": f"step {step}", **self.options, "processors": processors}
+        options: dict[str, Any] = {"name": f"step {step}", "videos": 0, **self.options}
+        options["processors"] = processors
         rows: list[TrialRow] = []
         for start in self.starts:
             options["env"] = {**self.options.get("env", {}), "start": start}

@@ -32,7 +32,9 @@ from lerobot_roborecover.evaluation.loading import HostSpec, load_host, load_pro
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.session import create_session
+from lerobot_roborecover.evaluation.videos import VideoRecorder, default_videos
 from lerobot_roborecover.evaluation.work_items import units_of
+from lerobot_roborecover.logs.log_file import videos_of_run
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.callables import (
@@ -45,7 +47,7 @@ from lerobot_roborecover.policies.identity import object_identity
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyRunner, ProvidesRunner
-from lerobot_roborecover.scenario import Scenario
+from lerobot_roborecover.scenario import Scenario, Start
 from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.utils.text import nearest, pluralize
 
@@ -64,6 +66,7 @@ def evaluate(
     device: str | None = None,
     name: str = "",
     log: str | Path | None = None,
+    videos: int | None = None,
     slots: int = 0,
     max_batch: int = 64,
     progress: bool = True,
@@ -91,6 +94,9 @@ def evaluate(
             Default: a checkpoint's identity, or an object's type and a hash of its weights, configuration and
             processors.
         log: trial log to write to; trials that it holds already are not run again. None keeps none.
+        videos: how many to keep, in a folder `videos_...` beside the log; `report` shows them. They are of
+            the first trials of scenarios spread over the set, the same for every policy. Default: 4 where
+            there is a log and the environment renders images, or `env` says `videos`; else none.
         slots: simulators at once; 0 takes what `roborecover eval` would.
         max_batch: observations per inference, at most.
         progress: show a line with trials, success so far and time left.
@@ -110,6 +116,7 @@ def evaluate(
         raise OptionError(f"trials={trials}: must be 1 or more")
     chosen = _scenario_set(scenarios, env)
     options = _env_config(env, chosen.platform)
+    kept = _video_count(videos, options, log)
     module: torch.nn.Module | None = policy if isinstance(policy, torch.nn.Module) else None
     with TemporaryFolder("evaluate") as folder, untouched(module):
         options.trial_log = str(log or folder / "trials.jsonl")
@@ -143,8 +150,15 @@ def evaluate(
                     line.show(counts)
 
             units = units_of(sorted(chosen, key=lambda s: s.id), trials)
-            places = EngineConfig(slots=slots, device=device, draws=options.obs_type != "state")
-            result = run_work_items(run, units, make_host, places, on_row=show)
+            draws = options.obs_type != "state" or kept > 0
+            places = EngineConfig(slots=slots, device=device, draws=draws)
+            recorder = None
+            if kept:
+                folder = videos_of_run(run.require_log().path, run.protocol.config_hash())
+                recorder = VideoRecorder(folder, kept, "sample", chosen.ids, Start(run.protocol.start))
+            result = run_work_items(run, units, make_host, places, on_row=show, videos=recorder)
+            if videos and recorder is not None and not recorder.kept:
+                logger.warning("no video was recorded: all trials were in the log. Take another log")
             if result.unrun:
                 count = pluralize(len(result.unrun), "trial")
                 logger.warning("%s could not be run, and have no row: %s", count, result.problem)
@@ -211,6 +225,16 @@ def _env_config(env: Mapping[str, Any] | RecoveryEnvConfig | None, platform: str
         return draccus.decode(kind, {**platform_named(platform).env_defaults, **(env or {})})
     except (draccus.utils.DraccusException, ValueError, TypeError) as err:
         raise OptionError(f"env={dict(env or {})}: {' '.join(str(err).split())}") from None
+
+
+def _video_count(videos: int | None, options: RecoveryEnvConfig, log: str | Path | None) -> int:
+    if videos is not None and videos < 0:
+        raise OptionError(f"videos={videos}: must be 0 or more")
+    if log is None and (videos or (videos is None and options.videos)):
+        raise OptionError("videos: they are kept beside the trial log; name one, evaluate(..., log=FILE)")
+    if log is None:
+        return 0
+    return default_videos(options) if videos is None else videos
 
 
 def _policy_config(policy: Any, device: str | None) -> PreTrainedConfig:

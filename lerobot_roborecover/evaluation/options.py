@@ -60,7 +60,8 @@ class RecoveryOptions:
     """Keep what was executed in every trial, in the folder `actions` beside the trial log: what forks and
     training data are made from."""
     videos: bool = False
-    """Render frames for LeRobot's videos also where the observation has no pixels."""
+    """Render frames for videos also where the observation has no pixels; `roborecover eval` then keeps four
+    videos, as with pixels."""
     realtime: bool = False
     """The simulator runs on while the policy thinks: an inference costs control steps, which count."""
     latency_s: float | None = None

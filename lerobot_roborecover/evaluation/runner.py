@@ -26,7 +26,7 @@ from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.sequential import open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
 from lerobot_roborecover.evaluation.short_names import ALIASES, long_names
-from lerobot_roborecover.evaluation.videos import SAMPLE, VideoRecorder, video_trial
+from lerobot_roborecover.evaluation.videos import VideoRecorder, default_videos, video_trial
 from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue, units_of
 from lerobot_roborecover.logs.extent import missing
 from lerobot_roborecover.logs.row import TrialRow
@@ -309,7 +309,7 @@ def host_spec(cfg: RecoveryEvalConfig) -> HostSpec:
 
 def _video_count(cfg: RecoveryEvalConfig) -> int:
     if cfg.runner.videos is None:
-        return SAMPLE if cfg.recovery_env.obs_type != "state" else 0
+        return default_videos(cfg.recovery_env)
     return cfg.runner.videos
 
 

@@ -11,13 +11,19 @@ import av
 import numpy as np
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.work_items import WorkItem
 from lerobot_roborecover.scenario import Outcome, Start
 
 KINDS = ("failures", "successes", "all", "sample")
-SAMPLE = 4
-"""Videos that a run with images keeps when `--runner.videos` says nothing."""
+_DEFAULT = 4
 _NAME = re.compile(r"(?P<id>.+?)(_(?P<start>initial|reversion))?_trial(?P<trial>\d+)_[a-z_]+")
+
+
+def default_videos(options: RecoveryOptions) -> int:
+    """Returns the number of videos that a run keeps when nothing says how many: some where the environment
+    renders images, or is told to render them for videos."""
+    return _DEFAULT if options.videos or getattr(options, "obs_type", "") != "state" else 0
 
 
 def video_trial(path: Path, start: Start) -> tuple[str, int] | None:

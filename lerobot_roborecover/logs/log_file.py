@@ -21,6 +21,11 @@ _GZIP, _ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
 _HEAD_BYTES = 2**16
 
 
+def videos_of_run(log: Path, config_hash: str) -> Path:
+    """Folder of the videos of one protocol's trials, beside a log that several policies may share."""
+    return log.with_name(f"videos_{config_hash[:8]}")
+
+
 class LogFileError(ValueError):
     """A file cannot be read as a trial log; the message says what it is and the remedy."""
 

@@ -25,3 +25,8 @@ def settings_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
 def digest_of(content: Any) -> str:
     """Returns a short hash of JSON-able content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+def short_identity(identity: str) -> str:
+    """Returns the first characters of an identity's hash: `callable@1a2b3c4d5e6f` is `1a2b3c`."""
+    return identity.rpartition("@")[2].removeprefix("run-")[:6]

@@ -63,9 +63,10 @@ class RunExtent:
     """`k/n`, k from 0, as the option has it."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class TrialRow:
-    """One finished trial. Flat, so that a log loads into any table library as it is.
+    """One finished trial. Flat, so that a log loads into any table library as it is. It prints short;
+    `dataclasses.asdict(row)` has all fields.
 
     Rows of one log share equal texts, `options` and `versions`; never change these in place.
     """
@@ -150,6 +151,11 @@ class TrialRow:
     robot: dict | None = None
     """What only a robot's trial has: start error, verdict, rater, reset time (`logs.robot.RobotTrial`).
     None for simulated trials, and in logs before schema 4."""
+
+    def __repr__(self) -> str:
+        names = ("scenario_id", "start", "trial", "policy", "outcome", "steps", "horizon")
+        shown = [*names, "reason"] if self.reason else names
+        return f"TrialRow({', '.join(f'{name}={getattr(self, name)!r}' for name in shown)})"
 
     def key(self) -> tuple:
         """What makes it the same trial: a rerun that meets the key again skips it."""

@@ -13,16 +13,17 @@ import re
 import sys
 import typing
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unicodedata import normalize
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.logs.fields import MAX_LINE_BYTES, FieldProblem
 from lerobot_roborecover.logs.log_file import LogFileError, LogTextError, appendable, open_log
+from lerobot_roborecover.logs.policy_settings import OBJECT, short_identity
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow, row_of
 from lerobot_roborecover.logs.schema import RowChecker, parse_json
 from lerobot_roborecover.scenario import Outcome
@@ -170,11 +171,17 @@ class _Kind(NamedTuple):
     run_seed: int | None
     recorded: bool
     """Whether they say all of their policy's files and options, as rows since schema 3 do."""
+    version: str
+    """Short hash of an object or a callable that the user named; empty for other policies."""
 
 
 def _nameless(policy: str) -> str:
     """A policy's name without the hashes and commits in it."""
     return re.sub(r"@[0-9a-f]{6,40}\b", "", policy)
+
+
+def _version(settings: Mapping[str, Any]) -> str:
+    return short_identity(str(settings.get(OBJECT, "")))
 
 
 class RowLog(typing.Protocol):
@@ -245,12 +252,16 @@ class TrialLog:
     def other_rows(self, protocol: EvalProtocol) -> list[str]:
         """Returns a line for each kind of rows of this policy and start that a run of the protocol does not
         reuse, or reuses although nothing says whose they are."""
-        other = earlier = unnamed = 0
+        other = earlier = unnamed = replaced = 0
+        own, versions = _version(protocol.policy_settings), set()
         for kind, count in self._kinds.items():
             if (kind.policy, kind.start) != (_nameless(protocol.policy), protocol.start):
                 continue
             if not kind.recorded:
                 earlier += count
+            elif kind.version and own and kind.version != own:
+                replaced += count
+                versions.add(kind.version)
             elif kind.config_hash != replace(protocol, run_seed=kind.run_seed).config_hash():
                 other += count
             elif protocol.policy == "unknown":
@@ -261,6 +272,12 @@ class TrialLog:
                 f"nothing says which policy this run has: {unnamed} row(s) in {self.path}, of a run that did "
                 "not say it either, are taken for its own. Give each policy a log of its own "
                 "(--env.trial_log)"
+            )
+        if replaced:
+            found.append(
+                f"this is version {own} of {protocol.policy}: {replaced} row(s) of version "
+                f"{', '.join(sorted(versions))} stay in {self.path} and are not reused; reports number the "
+                "versions and mark the newest"
             )
         if other:
             found.append(
@@ -314,6 +331,7 @@ class TrialLog:
                 row.config_hash,
                 row.run_seed,
                 row.policy_settings is not None,
+                _version(row.policy_settings or {}),
             )
             self._kinds[kind] += 1
 

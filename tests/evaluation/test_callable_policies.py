@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import lerobot_roborecover as roborecover
+from lerobot_roborecover.analysis.logs import read_study
+from lerobot_roborecover.analysis.pages.media import videos_beside
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.first_trials import PolicyFailedError
 from lerobot_roborecover.logs.trial_log import read_trial_log
@@ -62,6 +64,27 @@ def test_a_function_is_evaluated_and_named(dataset, tmp_path):
     assert settings["policy_type"] == "callable"
     assert settings["policy"].startswith("callable@")
     assert roborecover.evaluate(toward_the_puck, dataset, trials=2, log=log, **QUIET) == rows, "from the log"
+    assert re.fullmatch(
+        r"TrialRow\(scenario_id='\S+', start='recovery', trial=0, policy='mine', outcome='\w+', steps=\d+, "
+        r"horizon=12\)",
+        str(rows[0]),
+    )
+
+
+def test_versions_under_one_name_are_numbered_and_each_has_its_videos(dataset, tmp_path, caplog):
+    log, options = tmp_path / "trials.jsonl", {"env": {"obs_type": "state", "videos": True}, **QUIET}
+    for policy in (noisy, toward_the_puck):
+        with caplog.at_level(logging.WARNING):
+            rows = roborecover.evaluate(policy, dataset, trials=1, log=log, **options)
+        assert len(list((tmp_path / f"videos_{rows[0].config_hash[:8]}").glob("*_trial0_*.mp4"))) == 3
+    short = rows[0].policy_settings["policy"].removeprefix("callable@")[:6]
+    assert f"this is version {short} of mine: 3 row(s) of version" in caplog.text
+    study = read_study([str(log)])
+    first, second = study.policies
+    assert re.fullmatch(r"mine \[v1, [0-9a-f]{6}\]", first)
+    assert second == f"mine [v2, {short}, newest]"
+    rows = {arm.title: arm.rows for arm in study.arms}
+    assert [title for title, _ in videos_beside(study.files.items(), rows=rows)] == [first, second]
 
 
 def test_random_numbers_belong_to_the_trial(dataset):
@@ -139,6 +162,8 @@ def test_a_bad_answer_is_a_policy_error(policy, words):
         ({"policy": lambda observation: 0}, r"\(observation, instruction\)"),
         ({"rename_map": {"a": "b"}}, "rename_map"),
         ({"device": "cpu"}, "device"),
+        ({"env": {"videos": True}}, r"evaluate\(..., log=FILE\)"),
+        ({"videos": 2}, r"evaluate\(..., log=FILE\)"),
     ],
 )
 def test_bad_input_is_refused(dataset, changes, words):

@@ -10,35 +10,49 @@ from pathlib import Path
 
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo
 from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.logs.log_file import videos_of_run
+from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Start
 
 _OF_A_FOLDER = ("eval_episode_0.mp4", "replay.rrd")
 """Files that are called alike for all scenarios: the folder names the scenario."""
 TRIALS_SHOWN = 2
 """Of a policy on a scenario: two trials from one recovery point can be compared, more make a page heavy."""
+_HASH = re.compile(r"[0-9a-f]{16}")
+"""A protocol's hash; a log may say anything."""
 _TRIAL = re.compile(r"(?P<id>.+)_trial(?P<trial>\d+)(_\w+)?")
 
 
 def videos_beside(
-    logs: Iterable[tuple[str, Path]], starts: Mapping[str, Start] | None = None
+    logs: Iterable[tuple[str, Path]],
+    starts: Mapping[str, Start] | None = None,
+    rows: Mapping[str, Iterable[TrialRow]] | None = None,
 ) -> list[tuple[str, Path]]:
-    """Folders of the videos that `eval` left beside its logs.
+    """Folders of the videos that an evaluation left beside its logs: those of its own protocol (`evaluate`),
+    else `videos` (`roborecover eval`, `lerobot-eval`).
 
-    A folder that several arms of one start share is left out: the names of its videos do not tell arms apart.
+    A folder `videos` that several arms of one start share is left out: the names of its videos do not tell
+    arms apart.
 
     Args:
         logs: title of each arm and its log.
         starts: of the arms' trials, by title; by default recovery points.
+        rows: of the arms, by title, which say their protocols.
 
     Returns:
         Title and folder of each arm that has videos.
     """
-    starts = starts or {}
-    beside = dict.fromkeys((arm, log.parent / "videos") for arm, log in logs)
-    owners = Counter((folder, starts.get(arm, Start.RECOVERY)) for arm, folder in beside)
-    return [
+    starts, found, shared = starts or {}, [], {}
+    for arm, log in logs:
+        hashes = dict.fromkeys(row.config_hash for row in (rows or {}).get(arm, ()))
+        own = [videos_of_run(log, h) for h in hashes if _HASH.fullmatch(h) and videos_of_run(log, h).is_dir()]
+        found += [(arm, folder) for folder in own]
+        if not own:
+            shared[arm, log.parent / "videos"] = None
+    owners = Counter((folder, starts.get(arm, Start.RECOVERY)) for arm, folder in shared)
+    return found + [
         (arm, folder)
-        for arm, folder in beside
+        for arm, folder in shared
         if folder.is_dir() and owners[folder, starts.get(arm, Start.RECOVERY)] == 1
     ]
 

@@ -56,12 +56,16 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
     remarks: list[str] = []
     pages = [f"scenarios-{n + 1}.html" for n in range(len(found.boards))]
     beside = [pair for trials in found.trials for pair in trials.files.items()]
-    media = list(enumerate(config.media or videos_beside(beside)))
+    rows: dict[str, list[TrialRow]] = {}
+    for trials in found.trials:
+        for policy, own in _rows_of(trials.recovery).items():
+            rows.setdefault(policy, []).extend(own)
+    media = list(enumerate(config.media or videos_beside(beside, rows=rows)))
     with claim_page(out, ["index.html", "leaderboard.json", "README.md", *pages]):
         galleries = []
         for board, trials, name in zip(found.boards, found.trials, pages, strict=True):
             frames, certificate, problems = _frames(board, trials, out, config.render)
-            given = config.media or videos_beside(trials.files.items())
+            given = config.media or videos_beside(trials.files.items(), rows=_rows_of(trials.recovery))
             own = [(n, one) for n, one in media if one in given and one[0] in trials.recovery.arms]
             clips = _media(own, trials.recovery, out)
             cards = make_cards(
@@ -89,6 +93,14 @@ def write_space(found: Leaderboard, out: Path, config: SpaceConfig | None = None
             )
         atomic_write(out / "README.md", _card(config.title, found))
         return remarks
+
+
+def _rows_of(panel: Panel) -> dict[str, list[TrialRow]]:
+    """Rows by the title of their arm."""
+    found: dict[str, list[TrialRow]] = {}
+    for (arm, _), rows in panel.rows.items():
+        found.setdefault(panel.arms[arm], []).extend(rows)
+    return found
 
 
 def _frames(

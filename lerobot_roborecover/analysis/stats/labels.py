@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.policy_settings import OBJECT, digest_of, short_identity
 from lerobot_roborecover.logs.row import TrialRow
 
 _NOT_RECORDED = "settings not recorded"
@@ -16,7 +16,9 @@ _LONGEST = 28
 
 def tell_settings_apart(rows: Sequence[TrialRow]) -> None:
     """Adds what differs to the name of every policy that has rows under several settings, such as
-    `act@1a2b [num_inference_steps=2]`. The rows must be the caller's own: their `policy` is changed in place.
+    `act@1a2b [num_inference_steps=2]`. Versions of an object or a callable under one name are numbered in the
+    order in which they were evaluated first: `mine [v2, 1a2b3c, newest]`. The rows must be the caller's own:
+    their `policy` is changed in place.
     """
     kinds: dict[str, dict[str, list[TrialRow]]] = {}
     keys: dict[int, str] = {}
@@ -29,6 +31,9 @@ def tell_settings_apart(rows: Sequence[TrialRow]) -> None:
             continue
         settings = {key: of[0].policy_settings or {} for key, of in by_settings.items() if key}
         labels = {key: _label(own, settings.values()) for key, own in settings.items()}
+        if _telling(settings.values()) == [OBJECT] and all(OBJECT in own for own in settings.values()):
+            first = {key: min(row.finished_at for row in by_settings[key]) for key in settings}
+            labels = _versions(settings, sorted(settings, key=lambda key: first[key]))
         for key, of in by_settings.items():
             label = labels.get(key, _NOT_RECORDED)
             if list(labels.values()).count(label) > 1:
@@ -49,12 +54,26 @@ def _key(settings: dict[str, Any] | None) -> str:
 
 def _label(own: dict[str, Any], all_settings: Iterable[dict[str, Any]]) -> str:
     """What of a policy's settings is not the same in all of them."""
-    everywhere = list(all_settings)
-    names = sorted({name for settings in everywhere for name in settings})
-    telling = [n for n in names if any(s.get(n) != own.get(n) for s in everywhere)]
+    telling = _telling(all_settings)
     # An option that is as saved says nothing, unless nothing else is said.
     said = [f"{n}={_short(own[n])}" for n in telling if n in own] or [f"{n} as saved" for n in telling]
     return ", ".join(said[:_SHOWN]) + (", ..." if len(said) > _SHOWN else "") or "as saved"
+
+
+def _telling(all_settings: Iterable[dict[str, Any]]) -> list[str]:
+    """Names of the settings that are not the same in all."""
+    everywhere = list(all_settings)
+    names = sorted({name for settings in everywhere for name in settings})
+    return [n for n in names if any(s.get(n) != everywhere[0].get(n) for s in everywhere)]
+
+
+def _versions(settings: dict[str, dict[str, Any]], oldest_first: Sequence[str]) -> dict[str, str]:
+    """Labels of settings that differ in the policy's identity alone."""
+    labels = {}
+    for number, key in enumerate(oldest_first, 1):
+        newest = ", newest" if number == len(oldest_first) else ""
+        labels[key] = f"v{number}, {short_identity(str(settings[key][OBJECT]))}{newest}"
+    return labels
 
 
 def _short(value: Any) -> str:
