@@ -7,6 +7,23 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
+# Runs a silent command and says every so often that it is still at work: still WHAT COMMAND [ARGUMENT...]
+still() {
+    local what="$1" begun=$SECONDS beat status=0
+    shift
+    # The sleep holds neither the lock nor the output, which a reader would wait for after the end.
+    (
+        while sleep "${ROBORECOVER_SETUP_EVERY_S:-20}" >/dev/null 2>&1 9>&- && kill -0 "$$" 2>/dev/null; do
+            say "still $what ($((SECONDS - begun)) s)"
+        done
+    ) 9>&- &
+    beat=$!
+    "$@" || status=$?
+    kill "$beat" 2>/dev/null || true
+    wait "$beat" 2>/dev/null || true
+    return "$status"
+}
+
 # OpenGL for MuJoCo (EGL, and OSMesa as its fallback), Vulkan and libX11 for SAPIEN, FFmpeg's libraries for torchcodec,
 # Chromium for the tests of pages, and what builds egl_probe, which LIBERO asks for and which has no wheels.
 system_packages=(libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 mesa-vulkan-drivers libx11-6 ffmpeg chromium git cmake make g++)
@@ -77,7 +94,7 @@ if command -v flock >/dev/null; then
         flock 9
     fi
 fi
-install_system_packages "${system_packages[@]}"
+still "installing system packages" install_system_packages "${system_packages[@]}"
 scripts/vulkan.sh >/dev/null || say "no software Vulkan: without a GPU, RoboTwin renders nothing here"
 
 stamp="$venv/.set-up"
@@ -100,7 +117,7 @@ if ! "$venv/bin/python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12)
 fi
 # egl_probe asks for a CMake before 3.5, which CMake 4 refuses to be.
 export CMAKE_POLICY_VERSION_MINIMUM="${CMAKE_POLICY_VERSION_MINIMUM:-3.5}"
-say "installing Python packages in $venv (some GB the first time)"
+say "installing Python packages in $venv: 8.4 GB and 3 minutes beside the download, the first time"
 install_python_packages() {
     # Compiled once, here: where PYTHONDONTWRITEBYTECODE is set, as in many images, every process would compile all of
     # LeRobot and torch anew, which takes it half a minute.
@@ -122,6 +139,9 @@ if [[ -n "${tree:-}" ]]; then
     echo "lerobot[$extras] @ file://$(echo "$copy"/lerobot-*.whl)" >"$copy/overrides.txt"
     pinned=(-c "$copy/constraints.txt" --overrides "$copy/overrides.txt")
 fi
-install_python_packages || { sleep 5; install_python_packages; }
+still "installing Python packages" install_python_packages || {
+    sleep 5
+    still "installing Python packages, second try" install_python_packages
+}
 echo "$wanted" >"$stamp"
 say "done; 'source $venv/bin/activate' puts roborecover and lerobot-eval on the PATH"

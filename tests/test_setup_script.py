@@ -51,6 +51,7 @@ def start(clone):
     here = clone.parent
     env = os.environ | {
         "PATH": f"{here / 'programs'}:{os.environ['PATH']}", "PYTHON": sys.executable, "HERE": str(here),
+        "ROBORECOVER_SETUP_EVERY_S": "0.1",
     }  # fmt: skip
     return subprocess.Popen([clone / "scripts" / "setup.sh"], env=env, stderr=subprocess.PIPE, text=True)
 
@@ -63,6 +64,7 @@ def test_two_setups_in_one_clone_wait_for_each_other(clone):
                 break
         with start(clone) as second:
             said = second.stderr.readline()
+            assert "still installing Python packages" in first.stderr.readline()
             (clone.parent / "go").touch()
             assert "another setup is at work in this clone; waiting for it" in said
             assert second.wait(PATIENCE_S) == 0

@@ -18,6 +18,7 @@ POLICY = str(ROOT / "lerobot_roborecover" / "data" / "metaworld_act")
 STAND_INS = {
     "<Meta-World checkpoint>": POLICY,
     "outputs/train/act/checkpoints/last/pretrained_model": POLICY,
+    "cell=Approach-*|Place-*": "cell=Place-*",
     "trials=5": 'trials=1, env={"obs_type": "state"}',
 }
 """What a reader puts into a page, by what the page says."""
