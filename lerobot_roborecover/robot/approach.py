@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.robot.clock import clock_of
-from lerobot_roborecover.robot.connection import RobotError, asking, limits_of, positions
+from lerobot_roborecover.robot.connection import LIMIT_MARGIN, RobotError, asking, limits_of, positions
 from lerobot_roborecover.robot.points import RobotPoint
 
 _RATE_HZ = 20.0
@@ -65,7 +65,7 @@ def move_to(
     names = list(point.joints)
     bounds = np.array([limits_of(robot, given)[n] for n in names])
     here = _measure(robot, names)
-    path = point.approach
+    path = _within(point.approach, bounds)
     gaps = np.abs(path - here).max(1)
     start = int(gaps.argmin())
     if gaps[start] > config.max_detour:
@@ -77,7 +77,7 @@ def move_to(
         ):
             raise StoppedError("the straight way to the approach was not confirmed; move the arm by hand")
     for waypoint in path[start:]:
-        here = _follow(robot, names, here, waypoint, bounds, config, stopped)
+        here = _follow(robot, names, here, waypoint, config, stopped)
     clock = clock_of(robot)
     until = clock.now() + config.settle_s
     goal = path[-1]
@@ -90,18 +90,23 @@ def move_to(
     return dict(zip(names, error.tolist(), strict=True))
 
 
+def _within(path: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """(T, J) targets, inside the limits; what is a measurement's noise outside is moved to them."""
+    inside = np.clip(path, bounds[:, 0], bounds[:, 1])
+    if (np.abs(path - inside) > LIMIT_MARGIN * (bounds[:, 1] - bounds[:, 0])).any():
+        raise RobotError("the recorded approach leaves the calibrated limits; the robot was not moved")
+    return inside
+
+
 def _follow(
     robot: Any,
     names: list[str],
     start: np.ndarray,
     goal: np.ndarray,
-    bounds: np.ndarray,
     config: MotionConfig,
     stopped: Callable[[], bool],
 ) -> np.ndarray:
     """Takes small steps from the last target to the next one; returns it."""
-    if (goal < bounds[:, 0]).any() or (goal > bounds[:, 1]).any():
-        raise RobotError("a target lies outside the calibrated limits; the robot was stopped")
     steps = max(int(np.ceil(np.abs(goal - start).max() / config.speed * _RATE_HZ)), 1)
     clock = clock_of(robot)
     for step in range(1, steps + 1):

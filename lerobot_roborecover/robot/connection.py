@@ -14,6 +14,9 @@ import numpy as np
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.robot.points import RobotPoint
 
+LIMIT_MARGIN = 0.01
+"""Share of a joint's range by which a recorded position may be outside: at the end of its range, noise is."""
+
 
 class RobotError(RoboRecoverError, RuntimeError):
     """The robot cannot do what was asked; the message says what, why and the remedy."""
@@ -32,10 +35,17 @@ def connected(config: Any) -> Generator[Any]:
 
     Raises:
         RobotLostError: it cannot be connected.
+        RobotError: its configuration or its packages do not make a robot.
     """
     from lerobot.robots import make_robot_from_config
 
-    robot = make_robot_from_config(config)
+    try:
+        robot = make_robot_from_config(config)
+    except (ImportError, ValueError, OSError) as err:
+        cause = err.__cause__ or err  # LeRobot names the whole configuration, and then the reason
+        if isinstance(cause, RoboRecoverError):
+            raise cause from None
+        raise RobotError(f"--robot.type={config.type}: {_line(cause)}") from err
     try:
         robot.connect()
     except (ConnectionError, OSError, RuntimeError, ValueError) as err:
@@ -68,7 +78,7 @@ def asking(robot: Any) -> Generator[None]:
         ) from err
 
 
-def _line(err: Exception) -> str:
+def _line(err: BaseException) -> str:
     return " ".join(str(err).split())[:200] or type(err).__name__
 
 
@@ -172,7 +182,8 @@ def check_point(
     for name, (low, high) in limits.items():
         values = point.approach[:, columns.index(name)]
         worst = float(values[np.argmax(np.abs(values - (low + high) / 2))])
-        if not low <= worst <= high:
+        margin = LIMIT_MARGIN * (high - low)
+        if not low - margin <= worst <= high + margin:
             raise RobotError(
                 f"point {point.id}: joint {name} goes to {worst:.1f}, outside its calibrated {low:.1f} to "
                 f"{high:.1f}. The point is not run; calibrate the robot again or leave the point out"

@@ -22,6 +22,10 @@ from lerobot_roborecover.robot.reference import CHANGED, Reference, aligned, bac
 _MIN_REGION_PX = 12
 _SEARCH = 0.2
 """How far an object is looked for, as a share of the picture's side."""
+_MIN_SEEN = 0.1
+"""Least share of a drawn region that the arm has to leave open."""
+_ARM_OFF = 0.015
+"""Share of a picture's side by which an arm that came back may be off: servos give way under load."""
 _ALIKE = 0.15
 """Scores of an object behind the arm that differ by less do not tell its places apart."""
 _TAGS = cv2.aruco.DICT_4X4_50
@@ -50,9 +54,11 @@ def object_shift(reference: Reference, live: np.ndarray) -> tuple[float | None, 
         live: (H, W, 3) uint8, with the camera's own shift taken out.
 
     Returns:
-        None each where the region is too small, or has no structure.
+        None each where the region is too small, has no structure, or the arm stands before it.
     """
     reach = max(round(_SEARCH * max(reference.picture.shape[:2])), 3)
+    if _hidden(reference):
+        return None, None
     added = _added(reference)
     if added is not None:
         found = [_behind_the_arm(reference, live, _padded(box, added.shape), reach) for box in _boxes(added)]
@@ -135,6 +141,16 @@ def _added(reference: Reference) -> np.ndarray | None:
     if reference.drawn:
         added &= reference.objects
     return added if added.sum() >= _MIN_REGION_PX else None
+
+
+def _hidden(reference: Reference) -> bool:
+    """Whether the arm stands before nearly all of what people have drawn: that camera says nothing of it."""
+    if reference.arm is None or not reference.drawn:
+        return False
+    wide = 2 * round(_ARM_OFF * max(reference.arm.shape)) + 1
+    arm = cv2.dilate(reference.arm.astype(np.uint8), np.ones((wide, wide), np.uint8)).astype(bool)
+    seen = reference.objects & ~arm
+    return bool(seen.sum() < max(_MIN_REGION_PX, _MIN_SEEN * reference.objects.sum()))
 
 
 def _padded(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int, int, int]:

@@ -80,6 +80,11 @@ def test_a_blocked_joint_and_a_target_beyond_the_limits_stop_it(tmp_path):
         ):
             go(robot, where, config=replace(CONFIG, max_lag=10.0))
     with lab(tmp_path) as robot:
-        where = point(robot.world.positions() - (100.0, 0.0))
-        with pytest.raises(RobotError, match="outside the calibrated limits; the robot was stopped"):
+        where, sent = point(robot.world.positions() - (100.0, 0.0)), sent_by(robot)
+        with pytest.raises(RobotError, match="leaves the calibrated limits; the robot was not moved"):
             go(robot, where, given={"x.pos": (-1.0, 1.0)})
+        assert sent == []
+        # What noise has measured beyond the end of a joint's range is taken for the end.
+        end = where.joints["x.pos"]
+        assert max(map(abs, go(robot, where, given={"x.pos": (end + 0.5, 450.0)}).values())) <= 3.5
+        assert min(target[0] for target in sent) == end + 0.5

@@ -66,6 +66,10 @@ def test_an_object_half_behind_the_arm_is_measured_without_the_arm(offset_mm):
     reference = Reference.of(frames).with_boxes([tuple(box)])
     cleared = reference.with_cleared(seen(camera, away, (0.0, -0.35)), seen(camera, away))
     live = seen(camera, puck + np.array(offset_mm) / 1000)
+    left, top = (round(v) for v in (0.5 + HAND * (1, -1)) * 96)
+    assert compare(cleared.with_boxes([(left - 1, top - 1, 3, 3)]), live).object_px is None, (
+        "all behind the arm"
+    )
     assert compare(cleared, live).object_px * MM_PER_PX == pytest.approx(np.hypot(*offset_mm), abs=4.0)
 
 

@@ -13,7 +13,7 @@ class LabRobotConfig(RobotConfig):
     """The simulated lab's robot."""
 
     world: str = "table"
-    """`table` (a point mass and a puck; milliseconds a step) or `metaworld`."""
+    """`table` (a point mass and a puck; milliseconds a step), `so101` (extra `so101`) or `metaworld`."""
     task: str = ""
     """Task of the world; empty takes its first."""
     seed: int = 0

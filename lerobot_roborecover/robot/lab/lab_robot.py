@@ -29,7 +29,11 @@ def make_world(config: LabRobotConfig) -> World:
         from lerobot_roborecover.robot.lab.metaworld_world import MetaworldWorld
 
         return MetaworldWorld(config.size)
-    raise OptionError(f"--robot.world={config.world!r:.40}: the lab has table and metaworld")
+    if config.world == "so101":
+        from lerobot_roborecover.robot.lab.so101_world import So101World
+
+        return So101World(config.size)
+    raise OptionError(f"--robot.world={config.world!r:.40}: the lab has table, so101 and metaworld")
 
 
 class LabRobot(Robot):
