@@ -28,7 +28,13 @@ from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
-from lerobot_roborecover.evaluation.loading import HostSpec, load_host, load_processors, policy_config
+from lerobot_roborecover.evaluation.loading import (
+    HostSpec,
+    load_host,
+    load_processors,
+    policy_config,
+    remedy_of,
+)
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.session import create_session
@@ -125,7 +131,7 @@ def evaluate(
             slots = _check_callable(policy, given, slots)
             facts = callable_metadata(policy, name, n_episodes=trials)
             width = options.features["action"].shape[0]
-            make_host, device = partial(CallableRunner, policy, width, max_batch), "cpu"
+            make_host, device, remedy = partial(CallableRunner, policy, width, max_batch), "cpu", ""
         else:
             config = _policy_config(policy, device)
             spec = HostSpec(config, options, rename_map or {}, seed, max_batch)
@@ -135,7 +141,7 @@ def evaluate(
                 rename_map=rename_map, n_episodes=trials,
             )  # fmt: skip
             make_host = partial(_host, spec, policy, *own) if own else partial(load_host, spec)
-            device = str(config.device)
+            device, remedy = str(config.device), remedy_of(spec)
         chosen, run = create_session(
             options, options.run_spec(), workers=True, facts=facts, scenarios=chosen, run_seed=seed
         )
@@ -156,7 +162,9 @@ def evaluate(
             if kept:
                 folder = videos_of_run(run.require_log().path, run.protocol.config_hash())
                 recorder = VideoRecorder(folder, kept, "sample", chosen.ids, Start(run.protocol.start))
-            result = run_work_items(run, units, make_host, places, on_row=show, videos=recorder)
+            result = run_work_items(
+                run, units, make_host, places, on_row=show, videos=recorder, remedy=remedy
+            )
             if videos and recorder is not None and not recorder.kept:
                 logger.warning("no video was recorded: all trials were in the log. Take another log")
             if result.unrun:

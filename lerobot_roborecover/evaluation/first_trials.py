@@ -13,8 +13,11 @@ from lerobot_roborecover.utils.text import pluralize
 
 FIRST_TRIALS = 3
 """Trials that must fail alike; all of a shorter run."""
-_CHECK = "'roborecover check policy' with the same options says what policy and environment do not agree on"
-_CALLABLE = 'docs/api.md, "Any policy", says what a callable is given and what it returns'
+_CHECK = (
+    "'roborecover check policy' with the same options says what policy and environment do not agree on; "
+    "correct that"
+)
+_CALLABLE = 'docs/api.md, "Any policy", says what a callable is given and what it returns; correct it'
 
 
 class PolicyFailedError(RoboRecoverError, RuntimeError):
@@ -32,11 +35,12 @@ class FirstTrials:
     Args:
         trials: of the run.
         policy_type: of the policy, `policy_settings.CALLABLE` among others.
+        remedy: what to do, where it is known.
     """
 
-    def __init__(self, trials: int, policy_type: str | None = None):
+    def __init__(self, trials: int, policy_type: str | None = None, remedy: str = ""):
         self._limit = min(FIRST_TRIALS, trials)
-        self._remedy = _CALLABLE if policy_type == CALLABLE else _CHECK
+        self._remedy = remedy or (_CALLABLE if policy_type == CALLABLE else _CHECK)
         self._held: list[tuple[Trial, Replica]] = []
 
     def hold(self, trial: Trial, replica: Replica) -> bool:
@@ -56,7 +60,7 @@ class FirstTrials:
         reason = " ".join(trial.reason.removeprefix("at step 0: ").split()).rstrip(".")
         raise PolicyFailedError(
             f"{first} ended in the same policy error before any action, and the run was stopped: {reason}. "
-            f"No row was written. {self._remedy}; correct that, then run it again"
+            f"No row was written. {self._remedy[0].upper()}{self._remedy[1:]}, then run it again"
         )
 
     def release(self) -> list[tuple[Trial, Replica]]:

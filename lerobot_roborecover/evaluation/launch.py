@@ -88,6 +88,7 @@ def run_work_items(
     config: EngineConfig,
     *,
     stop: Callable[[], bool] = lambda: False,
+    remedy: str = "",
     **options: Any,
 ) -> RunResult:
     """Runs the work items that the session's trial log does not hold yet; without any, nothing is started.
@@ -99,6 +100,7 @@ def run_work_items(
         make_host: loads the policy. For a cluster it must travel: a module's function, or a partial of one.
         config: where, and how many at once.
         stop: asked between events; True starts no new trial and drops the running ones.
+        remedy: what to do where the first trials all fail alike, as far as it is known.
         options: of `Engine`, such as `on_row`, which is called with every finished trial's row.
 
     Raises:
@@ -110,7 +112,8 @@ def run_work_items(
     if not todo:
         return RunResult()
     if not run.rows():  # of a run that goes on, the policy is known to act
-        options["first"] = FirstTrials(len(todo), run.protocol.policy_settings.get("policy_type"))
+        policy_type = run.protocol.policy_settings.get("policy_type")
+        options["first"] = FirstTrials(len(todo), policy_type, remedy)
     try:
         engine = open_engine(run, todo, make_host, config, stop=stop, **options)
     except CallStoppedError:  # before the policy was loaded

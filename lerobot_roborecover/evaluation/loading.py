@@ -87,9 +87,13 @@ def load_host(spec: HostSpec) -> PolicyRunner:
             f"--policy.path={spec.policy.pretrained_path}: its actions have {other} values, {spec.env.type} "
             f"takes {width}. The checkpoint is for another robot or another kind of action"
         )
-    wanted = spec.policy.input_features or {}
-    with plain_loading(f"--policy.path={path}", lambda: input_remedy(spec.env, wanted, spec.rename_map)):
+    with plain_loading(f"--policy.path={path}", lambda: remedy_of(spec)):
         return _load_host(spec)
+
+
+def remedy_of(spec: HostSpec) -> str:
+    """What to do where the environment does not give the policy its inputs; empty where it does."""
+    return input_remedy(spec.env, spec.policy.input_features or {}, spec.rename_map)
 
 
 def _load_host(spec: HostSpec) -> PolicyRunner:

@@ -21,7 +21,7 @@ from lerobot_roborecover.evaluation.child import NESTED
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
-from lerobot_roborecover.evaluation.loading import HostSpec, load_host
+from lerobot_roborecover.evaluation.loading import HostSpec, load_host, remedy_of
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.sequential import open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
@@ -255,9 +255,11 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
         watch.record(log.path)
     if not settled():
         order = sorted(scenarios, key=lambda s: s.id) if watch is None else watch.order
+        spec = host_spec(cfg)
         result = run_work_items(
-            run, units_of(order, cfg.eval.n_episodes), partial(load_host, host_spec(cfg)), _places(cfg),
-            stop=stop, on_row=show, videos=videos, batch_delay_s=cfg.runner.batch_delay_ms / 1e3,
+            run, units_of(order, cfg.eval.n_episodes), partial(load_host, spec), _places(cfg),
+            stop=stop, remedy=remedy_of(spec), on_row=show, videos=videos,
+            batch_delay_s=cfg.runner.batch_delay_ms / 1e3,
             queue_of=WorkQueue if watch is None else OrderedQueue,
         )  # fmt: skip
     line.show(progress, final=True)

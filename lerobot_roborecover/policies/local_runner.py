@@ -100,6 +100,7 @@ class LocalPolicyRunner:
         self._device = next(policy.parameters()).device
         self._amp = bool(getattr(self._config, "use_amp", False))
         self._idle: list[PreTrainedPolicy] = []
+        self._raised: set[str] = set()
 
     def noise(self, seed: int | None) -> str:
         """How noise is drawn; the value of `TrialRow.noise`.
@@ -201,7 +202,7 @@ class LocalPolicyRunner:
         except Exception as err:  # a policy may raise anything, and it costs its trial alone
             problem = PolicyError(f"{type(err).__name__}: {err}")
             if len(observations) == 1:
-                logger.warning("the policy raised", exc_info=True)
+                self._warn(str(problem))
         if len(observations) == 1:
             return [problem]
         half = len(observations) // 2
@@ -242,8 +243,14 @@ class LocalPolicyRunner:
         except PolicyError as err:
             return err
         except Exception as err:  # a policy may raise anything, and it costs its trial alone
-            logger.warning("the policy raised", exc_info=True)
-            return PolicyError(f"{type(err).__name__}: {err}")
+            problem = PolicyError(f"{type(err).__name__}: {err}")
+            self._warn(str(problem))
+            return problem
+
+    def _warn(self, problem: str) -> None:
+        """Logs what the policy has just raised, with its traceback the first time."""
+        logger.warning("the policy raised %s", problem, exc_info=problem not in self._raised)
+        self._raised.add(problem)
 
     @property
     def parts(
