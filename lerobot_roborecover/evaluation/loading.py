@@ -18,7 +18,7 @@ from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
-from lerobot_roborecover.policies.command_line import plain_parsing
+from lerobot_roborecover.policies.command_line import only_meaningful_messages, plain_parsing
 from lerobot_roborecover.policies.determinism import fit_threads, make_cross_cpu_deterministic
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
 from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
@@ -103,7 +103,8 @@ def _load_host(spec: HostSpec) -> PolicyRunner:
     set_seed(spec.seed)
     fit_threads(spec.policy.device)
     rename_map = dict(spec.rename_map)
-    policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
+    with only_meaningful_messages():
+        policy = make_policy(cfg=spec.policy, env_cfg=spec.env, rename_map=rename_map)
     _check_trained(spec.policy, policy)
     policy.eval()
     if spec.cross_cpu_deterministic:

@@ -59,12 +59,24 @@ def run_with_arguments[C](command: Callable[[C], int], program: str, argv: Seque
         What the command returned: an exit code.
     """
     register_plugins()
-    for name in ("lerobot.configs.eval", "lerobot.policies.factory", None):
-        logging.getLogger(name).addFilter(_says_something)
     # LeRobot types the wrapped command as the bare one, which cannot be called without a configuration.
     wrapped: Callable[..., int] = parser.wrap()(command)
-    with process_arguments(program, argv), plain_parsing():
+    with only_meaningful_messages(), process_arguments(program, argv), plain_parsing():
         return wrapped()
+
+
+@contextmanager
+def only_meaningful_messages() -> Generator[None]:
+    """Leaves out the messages of LeRobot's that mean nothing in a recovery evaluation."""
+    loggers = [logging.getLogger(name) for name in ("lerobot.configs.eval", "lerobot.policies.factory", None)]
+    added = [one for one in loggers if _says_something not in one.filters]
+    for one in added:
+        one.addFilter(_says_something)
+    try:
+        yield
+    finally:
+        for one in added:
+            one.removeFilter(_says_something)
 
 
 _SAY_NOTHING = (

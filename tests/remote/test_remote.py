@@ -136,9 +136,10 @@ def test_mappings_that_are_refused(text, words):
         parse_mapping(text, "m.yaml")
 
 
-def test_the_example_of_the_docs_is_a_mapping():
+def test_the_examples_of_the_docs_are_mappings():
     page = (Path(__file__).parents[2] / "docs" / "servers.md").read_text()
-    (example,) = re.findall(r"```yaml\n(version.*?)```", page, re.DOTALL)
+    small, example = re.findall(r"```yaml\n(version.*?)```", page, re.DOTALL)
+    assert parse_mapping(small, "docs/servers.md").state[0].key == "state"
     assert parse_mapping(example, "docs/servers.md").window.frames == 2
 
 

@@ -234,7 +234,7 @@ def test_a_policy_for_another_platform_is_refused(act, diffusion):
     with pytest.raises(MappingError, match="actions of width 2, the environment takes 7"):
         make(output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))})
     policy = make(output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))})
-    with pytest.raises(MappingError, match=r"looks at .*environment_state.*the environment gives"):
+    with pytest.raises(MappingError, match=r"looks at .*environment_state.*--env.obs_type=state"):
         policy.select_action({"observation.state": torch.zeros(1, 4), "task": ["push"]})
     batch = {
         "observation.state": torch.zeros(2, 4),

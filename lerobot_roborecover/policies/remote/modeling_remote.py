@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE
 from torch import Tensor, nn
 
 from lerobot_roborecover.policies.remote.configuration_remote import REMOTE, RemoteConfig
@@ -345,10 +345,14 @@ class RemotePolicy(PreTrainedPolicy):
             return
         for key, shape in wanted.items():
             if key not in observation:
+                remedy = (
+                    "Start the server with --rename_map, or change the env's cameras and observation type"
+                )
+                if key == OBS_ENV_STATE:
+                    remedy = "Give --env.obs_type=state"
                 raise MappingError(
                     f"the policy at {self.config.url} looks at {sorted(wanted)}; the environment gives "
-                    f"{sorted(observation)}. Start the server with --rename_map, or change the env's cameras "
-                    "and observation type"
+                    f"{sorted(observation)}. {remedy}"
                 )
             have = observation[key].shape
             if len(shape) == 1 and list(shape) != list(have):
