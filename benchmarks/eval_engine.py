@@ -42,8 +42,7 @@ from lerobot_roborecover.evaluation.session import SimulatorSpec, create_session
 from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.policies.metadata import PolicyMetadata
-from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import WorkerSlot
 

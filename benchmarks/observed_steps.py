@@ -28,9 +28,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from engine_parts import StubHost, run_engine
 
 from lerobot_roborecover.workers import slots as slots_module
-from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, SlotConfig
-from lerobot_roborecover.workers.slot_server import SlotServer
-from lerobot_roborecover.workers.transport import make_memory
+from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, SlotConfig, make_memory
+from lerobot_roborecover.workers.worker import SlotServer
 from tests.support.factories import fake_scenario
 
 WAYS = {True: "memory", False: "pipes"}

@@ -17,8 +17,7 @@ from collections.abc import Iterable
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.scenario import Scenario
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.datasets.converted import say
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id, open_lerobot_folder

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
 from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array, read_group

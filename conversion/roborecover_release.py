@@ -20,7 +20,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.curation.split_dataset import SPLIT_FILE
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array, read_group
 from lerobot_roborecover.datasets.licenses import license_argument

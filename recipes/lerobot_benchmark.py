@@ -20,7 +20,7 @@ from lerobot_roborecover.analysis.leaderboard import make_leaderboard
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.benchmark import EVAL_FILE, eval_yaml, split_names
-from lerobot_roborecover.evaluation.envhub_files import write_envhub
+from lerobot_roborecover.evaluation.envhub import write_envhub
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from recipes.study.definition import IN_CHECKOUT, StudyDefinition, read_definition
 from recipes.study.stored import write_stored_logs

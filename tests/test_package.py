@@ -83,10 +83,9 @@ def test_gymnasium_makes_an_environment_by_module_and_id(first):
 
 def test_a_worker_needs_neither_lerobot_nor_torch():
     code = (
-        "from lerobot_roborecover.workers import slot_server\n"
         "from lerobot_roborecover.workers import jobs, worker\n"
         "from lerobot_roborecover.workers.messages import SlotConfig\n"
-        "slot_server.SlotServer(SlotConfig('fake'))"
+        "worker.SlotServer(SlotConfig('fake'))"
     )
     assert not modules_after(code) & set(HEAVY)
 
@@ -94,7 +93,7 @@ def test_a_worker_needs_neither_lerobot_nor_torch():
 @pytest.mark.slow
 def test_a_running_metaworld_worker_loads_neither_lerobot_nor_torch():
     code = (
-        "from lerobot_roborecover.workers.slot_server import SlotServer\n"
+        "from lerobot_roborecover.workers.worker import SlotServer\n"
         "from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig\n"
         "from lerobot_roborecover import load_scenarios\n"
         "server = SlotServer(SlotConfig('metaworld', {'obs_type': 'state'}))\n"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from lerobot_roborecover.cli.config_command import run_config_command
 from lerobot_roborecover.evaluation.early_checks import ENV, POLICY, ConfigSource
-from lerobot_roborecover.evaluation.short_names import JSON
+from lerobot_roborecover.evaluation.options import JSON
 
 HELP = "try a policy for a few steps and look for the usual mistakes; takes lerobot-eval's arguments, --json"
 SOURCE = ConfigSource(

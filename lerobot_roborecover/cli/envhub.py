@@ -34,7 +34,7 @@ OPTIONS = EnvHubOptions
 def run(options: EnvHubOptions) -> int:
     """Writes the files and says how to upload them."""
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.evaluation.envhub_files import write_envhub
+    from lerobot_roborecover.evaluation.envhub import write_envhub
 
     found = load_scenarios(options.scenarios, revision=options.revision, split=options.split)
     for path in write_envhub(found, options.out, options.repo_id, options.split):

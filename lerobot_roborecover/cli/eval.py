@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from lerobot_roborecover.cli.config_command import run_config_command
 from lerobot_roborecover.evaluation.early_checks import ENV, POLICY, ConfigSource
-from lerobot_roborecover.evaluation.short_names import ALIASES
+from lerobot_roborecover.evaluation.options import ALIASES
 
 HELP = "evaluate a policy, every simulator busy; takes lerobot-eval's arguments and --runner.*"
 SOURCE = ConfigSource(

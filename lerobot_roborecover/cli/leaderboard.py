@@ -101,7 +101,7 @@ def run(options: LeaderboardOptions) -> int:
 def _write_space(options: SpaceOptions, title: str, logs: Path, found: Leaderboard) -> None:
     from lerobot_roborecover.analysis.named_path import split_named
     from lerobot_roborecover.analysis.pages.space import SpaceConfig, write_space
-    from lerobot_roborecover.logs.actions import ACTIONS_FOLDER
+    from lerobot_roborecover.logs.row import ACTIONS_FOLDER
 
     assert options.space is not None
     media = [(name, Path(folder)) for name, folder in map(split_named, options.videos)]

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 from lerobot_roborecover._version import __version__
 from lerobot_roborecover.cli.arguments import Parser, add_options, check_checkpoints, read_options
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.cli.tree import (
     COMMANDS,
     GROUPS,
@@ -73,11 +73,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done; 1 done but something is wrong; 2 refused; others as `guarded`.
     """
     if argv is None:
-        from lerobot_roborecover.policies import policy_thread
+        from lerobot_roborecover.policies import watchdog
 
-        policy_thread.own_process()
+        watchdog.own_process()
         status = main(sys.argv[1:])
-        policy_thread.exit_process(status)
+        watchdog.exit_process(status)
         return status
     call = find_call(argv)
     if call is None:

@@ -27,8 +27,7 @@ from lerobot_roborecover.datasets.replay_log import (
 )
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.replay.handoff import hand_off, with_fixtures
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off, with_fixtures
 from lerobot_roborecover.scenario import Fingerprint, Scenario, ScenarioError
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker

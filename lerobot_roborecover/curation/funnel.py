@@ -15,8 +15,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from lerobot_roborecover.datasets.files import finish_update
 from lerobot_roborecover.datasets.schema import FOLDER
-from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_file
 from lerobot_roborecover.utils.journal import Journal, read_journal

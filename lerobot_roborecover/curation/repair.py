@@ -29,11 +29,11 @@ from lerobot_roborecover.curation.funnel import (
     read_decisions,
     record_decisions,
 )
+from lerobot_roborecover.datasets.files import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.load import load_scenarios
 from lerobot_roborecover.datasets.repair import Repaired, read_edited, repair
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectories import TrajectoryRow, actions_sha256
-from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.text import pluralize
 

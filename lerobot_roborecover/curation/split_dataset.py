@@ -21,10 +21,10 @@ from lerobot_roborecover.curation.funnel import (
 )
 from lerobot_roborecover.curation.split import SplitConfig, apart_for, assign, groups_of, shared
 from lerobot_roborecover.datasets.contents import list_files
+from lerobot_roborecover.datasets.files import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER
-from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write

@@ -9,9 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lerobot_roborecover.datasets.load import ScenarioSet, load_scenarios
+    from lerobot_roborecover.datasets.load import ScenarioSet, load_scenarios, validate_for
     from lerobot_roborecover.datasets.read import read_scenarios
-    from lerobot_roborecover.datasets.select import validate_for
     from lerobot_roborecover.datasets.write import write_scenarios
 
 _EXPORTS = {

@@ -12,8 +12,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from lerobot_roborecover.datasets.files import load_json
-from lerobot_roborecover.datasets.update import finish_update, is_update_file
+from lerobot_roborecover.datasets.files import finish_update, is_update_file, load_json
 from lerobot_roborecover.scenario import ScenarioError
 
 MAX_FILES = 100_000

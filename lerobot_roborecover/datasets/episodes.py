@@ -15,8 +15,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets.frames import LastFrames, Tail
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.simulator import Observation, Simulator
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import Observation, Simulator, iter_steps
 from lerobot_roborecover.scenario import Scenario
 
 EXACT_ACTION = "roborecover.action"

@@ -16,7 +16,7 @@ from typing import BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_roborecover.datasets.files import read_bytes
+from lerobot_roborecover.datasets.files import finish_update, read_bytes
 from lerobot_roborecover.datasets.frames import LastFrames
 from lerobot_roborecover.datasets.parquet_bounds import check_bounds
 from lerobot_roborecover.datasets.schema import (
@@ -26,7 +26,6 @@ from lerobot_roborecover.datasets.schema import (
     MAX_MANIFEST_BYTES,
     check_frame,
 )
-from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 FRAMES_FOLDER = "frames"

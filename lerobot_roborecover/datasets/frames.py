@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import iter_steps
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER
 from lerobot_roborecover.datasets.load import ScenarioSet
 from lerobot_roborecover.datasets.schema import package_versions
 from lerobot_roborecover.platforms.robot_fingerprint import NAME, is_robot_entry
-from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import Simulator, iter_steps
 from lerobot_roborecover.scenario import DeviationType, Pose, Scenario, ScenarioError, Stage
 from lerobot_roborecover.utils.text import align, pluralize
 

@@ -1,21 +1,29 @@
-"""Finds a scenario set by name, folder or Hub id, reads it, and hands it out as an immutable sequence."""
+"""Finds a scenario set by name, folder or Hub id, reads it, and hands it out as an immutable sequence.
+
+The selection language: an expression is terms separated by ";", all of which must hold. A term is
+`key=value`, or `key=value|value` for any of several; values take the shell wildcards `*`, `?` and `[...]` and
+are compared with case. Keys: id, suite, task, stage, type, cell, source, policy, split. Example:
+
+    suite=libero_goal|libero_10; source=natural; cell=Approach-*
+"""
 
 from __future__ import annotations
 
+import fnmatch
 import importlib.resources
 import logging
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
 
+from lerobot_roborecover.datasets.files import finish_update
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
-from lerobot_roborecover.datasets.select import select_scenarios, validate_for
-from lerobot_roborecover.datasets.update import finish_update
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 
 __all__ = ["ScenarioSet", "builtin_names", "load_scenarios", "validate_for"]
@@ -24,6 +32,19 @@ logger = logging.getLogger(__name__)
 
 HUB_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}")
 """An id on the Hub: org/name."""
+
+_KEYS: dict[str, Callable[[Scenario], str]] = {
+    "id": lambda s: s.id,
+    "suite": lambda s: s.task.suite,
+    "task": lambda s: s.task.name,
+    "stage": lambda s: s.stage.value,
+    "type": lambda s: s.deviation.value,
+    "cell": lambda s: s.cell,
+    "source": lambda s: s.source.value,
+    "policy": lambda s: s.source_policy,
+    "split": lambda s: s.split,
+}
+_SHOWN_VALUES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +107,7 @@ class ScenarioSet(Sequence[Scenario]):
         return item in self._by_id
 
     def select(self, expression: str) -> ScenarioSet:
-        """The scenarios that an expression selects; see `lerobot_roborecover.datasets.select`."""
+        """The scenarios that an expression selects; see the top of this module."""
         return replace(self, scenarios=tuple(select_scenarios(self.scenarios, expression)))
 
     def shard(self, k: int, n: int) -> ScenarioSet:
@@ -185,3 +206,97 @@ def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path,
             f"revision {revision!r}; leave the revision out, or name a Hub dataset"
         )
     return root, None
+
+
+def _parse_selection(expression: str) -> list[tuple[str, tuple[str, ...]]]:
+    """The terms of an expression as (key, patterns); none for a blank expression.
+
+    Raises:
+        ScenarioError: a term is empty or has no `key=value` form, or a key is unknown.
+    """
+    if not expression.strip():
+        return []
+    terms = []
+    for number, term in enumerate(expression.split(";"), 1):
+        key, equals, values = (part.strip() for part in term.partition("="))
+        patterns = tuple(value.strip() for value in values.split("|"))
+        if not equals or not key or not all(patterns):
+            raise ScenarioError(
+                f"selection {expression!r}: term {number} is {term.strip()!r}; write key=value or "
+                f"key=value|value, terms separated by ';'. Keys: {', '.join(_KEYS)}"
+            )
+        if key not in _KEYS:
+            raise ScenarioError(f"selection {expression!r}: unknown key {key!r}. Keys: {', '.join(_KEYS)}")
+        terms.append((key, patterns))
+    return terms
+
+
+def select_scenarios(scenarios: Sequence[Scenario], expression: str) -> list[Scenario]:
+    """The scenarios for which every term holds, in their order.
+
+    Raises:
+        ScenarioError: the expression is malformed, one of its values matches no scenario at all (a
+            misspelling would otherwise shrink a selection unseen), or nothing is left; the message lists what
+            there is.
+    """
+    terms = _parse_selection(expression)
+    for key, patterns in terms:
+        values = {_KEYS[key](s) for s in scenarios}
+        for pattern in patterns:
+            if not any(fnmatch.fnmatchcase(value, pattern) for value in values):
+                raise ScenarioError(
+                    f"selection {expression!r}: {key}={pattern} matches none of {len(scenarios)} scenarios. "
+                    f"There are: {_tally(scenarios, key)}"
+                )
+    chosen = [
+        s
+        for s in scenarios
+        if all(any(fnmatch.fnmatchcase(_KEYS[k](s), p) for p in patterns) for k, patterns in terms)
+    ]
+    if not chosen:
+        listed = "; ".join(f"{key}: {_tally(scenarios, key)}" for key in dict.fromkeys(k for k, _ in terms))
+        raise ScenarioError(
+            f"selection {expression!r} is empty: no scenario fulfils all its terms at once. "
+            f"There are {listed}"
+        )
+    return chosen
+
+
+def _tally(scenarios: Iterable[Scenario], key: str) -> str:
+    """The values of a key with their numbers, the most frequent first."""
+    found = Counter(_KEYS[key](s) for s in scenarios)
+    shown = ", ".join(f"{value} ({count})" for value, count in found.most_common(_SHOWN_VALUES))
+    more = len(found) - _SHOWN_VALUES
+    return shown + (f", and {more} more" if more > 0 else "")
+
+
+def validate_for(scenarios: Sequence[Scenario], platform: str) -> None:
+    """Checks that a platform can run every scenario, before any simulator starts.
+
+    Args:
+        scenarios: what is to be run.
+        platform: that of the env type which is to run it, e.g. `libero` for `roborecover_libero`.
+
+    Raises:
+        ScenarioError: there are none, they are of another platform, or a suite or task is unknown to the
+            platform.
+    """
+    from lerobot_roborecover.platforms import platform_named
+
+    own = platform_named(platform)
+    if not scenarios:
+        raise ScenarioError("there are no scenarios to run; check the selection")
+    for scenario in scenarios:
+        if scenario.platform != platform:
+            raise ScenarioError(
+                f"scenario {scenario.id} is of platform {scenario.platform!r}, but the env type is "
+                f"roborecover_{platform}; use --env.type=roborecover_{scenario.platform}"
+            )
+    checked = set()
+    for scenario in scenarios:
+        if scenario.task not in checked:
+            try:
+                own.check_task(scenario.task)
+            except ScenarioError as err:
+                raise ScenarioError(f"scenario {scenario.id}: {err}") from None
+            checked.add(scenario.task)

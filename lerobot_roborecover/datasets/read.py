@@ -25,13 +25,13 @@ import pyarrow.parquet as pq
 
 from lerobot_roborecover.datasets.files import read_bytes, what_it_is
 from lerobot_roborecover.datasets.parquet_bounds import check_bounds
-from lerobot_roborecover.datasets.parquet_read import number_view
-from lerobot_roborecover.datasets.row_limits import (
+from lerobot_roborecover.datasets.parquet_read import (
     JSON_CONTAINERS_PER_ROW,
     MAX_JSON_CONTAINERS,
     RowTooLongError,
     check_lengths,
     json_containers,
+    number_view,
 )
 from lerobot_roborecover.datasets.schema import (
     FOLDER,

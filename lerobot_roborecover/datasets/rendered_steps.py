@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.platforms import Observation, Simulator, make_simulator
-from lerobot_roborecover.platforms.simulator import ShowsProgress
-from lerobot_roborecover.platforms.stepping import follow
+from lerobot_roborecover.platforms.simulator import ShowsProgress, follow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 

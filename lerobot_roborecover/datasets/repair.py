@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_roborecover.datasets.episodes import SCENARIO_INDEX
+from lerobot_roborecover.datasets.files import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import LastFrames
 from lerobot_roborecover.datasets.load import load_scenarios
@@ -30,7 +31,6 @@ from lerobot_roborecover.datasets.trajectories import (
     read_trajectories,
 )
 from lerobot_roborecover.datasets.trajectory_write import write_metadata
-from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.datasets.write import replace_scenarios
 from lerobot_roborecover.scenario import Scenario, ScenarioError

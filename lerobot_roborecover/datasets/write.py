@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from lerobot_roborecover._version import __version__
 from lerobot_roborecover.datasets.episodes import render_prefix
+from lerobot_roborecover.datasets.files import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.frame_files import FRAMES_FOLDER, write_frames
 from lerobot_roborecover.datasets.frames import LastFrames
 from lerobot_roborecover.datasets.schema import (
@@ -31,7 +32,6 @@ from lerobot_roborecover.datasets.schema import (
     package_versions,
     to_row,
 )
-from lerobot_roborecover.datasets.update import FolderUpdate, update_folder
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_file, atomic_write, remove_stale
@@ -52,7 +52,7 @@ def write_scenarios(
 ) -> Path:
     """Writes `meta/roborecover/scenarios.parquet` and `manifest.json` below a dataset's root.
 
-    A reader sees the old set or the new set, never a mixture (`update.update_folder`).
+    A reader sees the old set or the new set, never a mixture (`files.update_folder`).
 
     Args:
         root: the dataset's folder; made if missing, and replaced set by set if there already is one.

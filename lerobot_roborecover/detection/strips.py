@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_roborecover.analysis.figures.detection import FrameStrip
 from lerobot_roborecover.detection.trials import ReplayedTrial
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.stepping import follow
+from lerobot_roborecover.platforms.simulator import follow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.workers.jobs import Done, JobError, JobPool, simulator_of_worker
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.evaluation.trial_state import TrialState
+from lerobot_roborecover.evaluation.trial import Trial, TrialState
 from lerobot_roborecover.evaluation.videos import VideoWriter
 from lerobot_roborecover.evaluation.work_items import WorkItem
 from lerobot_roborecover.policies.runner import Replica

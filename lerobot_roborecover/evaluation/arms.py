@@ -7,15 +7,17 @@ where it was, an arm that has finished is not run again, and a failure shows the
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.evaluation.child import run_program, this_module
-from lerobot_roborecover.evaluation.own_log import claim_log
+from lerobot_roborecover.platforms.versions import row_versions
+from lerobot_roborecover.policies.identity import content_hash, policy_identity
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.text import output_end
@@ -23,6 +25,9 @@ from lerobot_roborecover.utils.text import output_end
 DONE_FILE = "done.json"
 """Beside the log of an arm: the run that it was, and whether it has finished."""
 _SHOWN_LINES = 12
+
+IDENTITY_FILE = "identity.json"
+"""Beside the log: whose rows it holds."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class Arm:
     argv: Sequence[str]
     """Arguments of `roborecover`."""
     identity: Mapping[str, Any]
-    """What all rows of the log must share, see `own_log.identity_of_run`."""
+    """What all rows of the log must share, see `identity_of_run`."""
     decides: Any = None
     """What the run must share with a finished one, JSON-able; the arguments where it is None."""
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -110,3 +115,61 @@ def failure(name: str, status: int, output: Path | None, done: str = "") -> str:
         f"{ended}: {cause or 'it said nothing'}\nThe end of {output}:\n{shown}\n"
         "Run the same command again to go on with what is left; 'roborecover doctor' checks this machine"
     )
+
+
+def identity_of_run(platform: str, policy: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+    """Returns what all rows of a run's log must share.
+
+    Args:
+        platform: of its scenarios.
+        policy: options of the policy, members as mappings; the content of a checkpoint or a mapping file
+            takes the place of its path.
+        others: whatever else decides the run's results, JSON-able.
+    """
+    versions = row_versions(platform) if platform else {}
+    return json.loads(
+        json.dumps({"policy": _by_content(policy), "versions": versions, **others}, default=str)
+    )
+
+
+def claim_log(log: Path, identity: Mapping[str, Any], say: Callable[[str], None] = print) -> None:
+    """Makes a log the run's own: one with rows of another identity, or of an unknown one, is moved aside.
+
+    Args:
+        log: the trial log; need not exist.
+        identity: of `identity_of_run`.
+        say: takes the line that says what was moved.
+    """
+    beside = log.with_name(IDENTITY_FILE)
+    text = json.dumps(identity, indent=1, sort_keys=True) + "\n"
+    if beside.is_file() and beside.read_text(encoding="utf-8") == text:
+        return
+    if log.exists() and log.stat().st_size:
+        there = next(path for path in _names(log) if not path.exists())
+        os.replace(log, there)
+        say(
+            f"{log} holds trials of another policy or setting, or of an earlier version that does not say: "
+            f"they are not reused, and are now in {there}"
+        )
+    atomic_write(beside, text)
+
+
+def _names(log: Path) -> Iterator[Path]:
+    number = 0
+    while True:
+        number += 1
+        yield log.with_name(f"{log.name}.before-{number}")
+
+
+def _by_content(policy: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for name, value in policy.items():
+        if isinstance(value, Mapping):
+            found[name] = _by_content(value)
+        elif name == "path" and value:
+            found[name] = policy_identity(str(value), policy.get("revision"))
+        elif isinstance(value, str) and value.endswith((".yaml", ".yml")) and Path(value).is_file():
+            found[name] = content_hash(Path(value))
+        else:
+            found[name] = value
+    return found

@@ -25,9 +25,9 @@ from lerobot_roborecover.evaluation import check_numbers as numbers
 from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scenario, take_steps
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.missing_inputs import input_remedy
+from lerobot_roborecover.evaluation.options import JSON, long_names
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
-from lerobot_roborecover.evaluation.short_names import JSON, long_names
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.findings import (
     Check,

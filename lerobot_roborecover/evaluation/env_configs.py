@@ -15,9 +15,11 @@ from lerobot.configs import FeatureType
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.lerobot_introspection import metadata_of_caller
+from lerobot_roborecover.evaluation.lerobot_introspection import (
+    choose_processors_in_scripts,
+    metadata_of_caller,
+)
 from lerobot_roborecover.evaluation.options import RecoveryOptions
-from lerobot_roborecover.evaluation.processors import choose_processors_in_scripts
 from lerobot_roborecover.evaluation.session import SimulatorSpec
 from lerobot_roborecover.evaluation.vector_env import ScenarioVectorEnv, create_recovery_envs
 from lerobot_roborecover.platforms import Platform, all_platforms, platform_named

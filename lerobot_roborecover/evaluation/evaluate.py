@@ -28,6 +28,7 @@ from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig, env_type
 from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
+from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
 from lerobot_roborecover.evaluation.loading import (
     HostSpec,
     load_host,
@@ -35,7 +36,6 @@ from lerobot_roborecover.evaluation.loading import (
     policy_config,
     remedy_of,
 )
-from lerobot_roborecover.evaluation.processors import env_processors
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.videos import VideoRecorder, default_videos

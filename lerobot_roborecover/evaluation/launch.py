@@ -18,8 +18,8 @@ from lerobot_roborecover.evaluation.scheduler import Engine
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.work_items import WorkItem, first_units, unfinished
 from lerobot_roborecover.platforms import SimulatorError
-from lerobot_roborecover.policies.policy_thread import CallStoppedError, PolicyThread
 from lerobot_roborecover.policies.runner import InlineReplica, PolicyRunner
+from lerobot_roborecover.policies.watchdog import CallStoppedError, PolicyThread
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.backend import LOCAL, Backend, WorkerStartup

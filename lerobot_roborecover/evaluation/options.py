@@ -1,8 +1,10 @@
-"""The options every recovery env type has, and what they ask for once checked."""
+"""The options every recovery env type has, what they ask for once checked, and the short names that
+`roborecover eval` has for some and `lerobot-eval` does not."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,20 @@ __all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
 GROUPS = ("suite", "cell", "source")
 POLICY_WATCHDOG_S = 1800.0
 """Compiling a policy for the CPU takes minutes, and so does a batch of 64 for a large one."""
+
+ALIASES = {
+    "engine": "runner.engine",
+    "videos": "runner.videos",
+    "limit-seconds": "runner.limit_seconds",
+    "sequential": "runner.sequential",
+    "shard": "env.shard",
+    "retry": "runner.retry",
+}
+"""Long name of each."""
+JSON = {"json": "check.json=true"}
+"""Of `roborecover check policy`: what the switch stands for."""
+ALONE = "alone"
+"""Value of `--runner.sequential` that compares with no other log."""
 
 
 @dataclass
@@ -123,3 +139,25 @@ class RecoveryOptions:
         if output_dir is not None:
             return output_dir / "trials.jsonl"
         return Path("outputs/roborecover") / time.strftime("%Y-%m-%d_%H-%M-%S") / "trials.jsonl"
+
+
+def long_names(argv: Sequence[str], short: Mapping[str, str]) -> list[str]:
+    """All arguments under their long names; `--sequential` without a log is given its value.
+
+    Args:
+        argv: arguments.
+        short: long names.
+    """
+    found = [_long_name(argument, short) for argument in argv]
+    for k, name in enumerate(found):
+        if name == "--runner.sequential" and (k + 1 == len(found) or found[k + 1].startswith("--")):
+            found[k] = f"{name}={ALONE}"
+    return found
+
+
+def _long_name(argument: str, short: Mapping[str, str]) -> str:
+    """`--videos=3` as `--runner.videos=3`, and the like."""
+    name, _, value = argument.removeprefix("--").partition("=")
+    if not argument.startswith("--") or name not in short:
+        return argument
+    return f"--{short[name]}={value}" if value else f"--{short[name]}"

@@ -22,10 +22,10 @@ from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
 from lerobot_roborecover.evaluation.loading import HostSpec, load_host, remedy_of
+from lerobot_roborecover.evaluation.options import ALIASES, long_names
 from lerobot_roborecover.evaluation.progress import ProgressLine, RunProgress
 from lerobot_roborecover.evaluation.sequential import open_watch
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
-from lerobot_roborecover.evaluation.short_names import ALIASES, long_names
 from lerobot_roborecover.evaluation.videos import VideoRecorder, default_videos, video_trial
 from lerobot_roborecover.evaluation.work_items import OrderedQueue, WorkQueue, units_of
 from lerobot_roborecover.logs.extent import missing

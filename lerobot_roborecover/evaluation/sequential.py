@@ -22,8 +22,8 @@ from lerobot_roborecover.analysis.stats.sequential import RateSequence, Sequenti
 from lerobot_roborecover.analysis.stats.units import default_unit, initial_unit, unit_labels
 from lerobot_roborecover.analysis.stats.verdicts import LEAST_DIFFERING
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.options import ALONE
 from lerobot_roborecover.evaluation.progress import RunProgress
-from lerobot_roborecover.evaluation.short_names import ALONE
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow
 from lerobot_roborecover.logs.sequential_record import SequentialRecord, read_record, write_record
 from lerobot_roborecover.logs.trial_log import read_log

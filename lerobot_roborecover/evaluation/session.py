@@ -20,8 +20,14 @@ from lerobot_roborecover.evaluation.options import POLICY_WATCHDOG_S, RecoveryOp
 from lerobot_roborecover.evaluation.real_time import RealTime
 from lerobot_roborecover.evaluation.session_checks import check_batch, check_intervention, check_versions
 from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions
-from lerobot_roborecover.logs.row import EvalProtocol, RunExtent, TrialRow, trial_key
+from lerobot_roborecover.logs.row import (
+    ACTIONS_FOLDER,
+    EvalProtocol,
+    RunExtent,
+    TrialRow,
+    put_actions,
+    trial_key,
+)
 from lerobot_roborecover.logs.trial_log import RowLog, TrialLog, check_retry
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.versions import row_versions

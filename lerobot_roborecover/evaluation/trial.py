@@ -21,6 +21,7 @@ actions.
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any
 from typing import Protocol as Interface
 
@@ -28,12 +29,11 @@ import numpy as np
 
 from lerobot_roborecover.evaluation.intervention_record import InterventionRecord
 from lerobot_roborecover.evaluation.real_time import LatencyModel, RealTime
-from lerobot_roborecover.evaluation.trial_state import FAILURES, IN_SIMULATOR, TrialState
-from lerobot_roborecover.logs.actions import actions_digest
 from lerobot_roborecover.logs.row import (
     EvalProtocol,
     RunExtent,
     TrialRow,
+    actions_digest,
     make_row,
     trial_key,
     trial_seed,
@@ -53,7 +53,36 @@ from lerobot_roborecover.workers.messages import (
     StepResult,
 )
 
+FAILURES = {
+    "raised": Outcome.SIM_ERROR,
+    "died": Outcome.SIM_ERROR,
+    "hung": Outcome.TIMEOUT,
+    "lost": Outcome.SIM_ERROR,
+}
+"""Outcome of a trial by the kind of its slot's failure; a `lost` trial is first run again elsewhere."""
+
 SOLVED_THERE = "the task's predicate already holds where the rollback went"
+
+
+class TrialState(StrEnum):
+    NEW = "new"
+    """No request has been sent yet."""
+    HANDING_OFF = "handing_off"
+    """A simulator rebuilds its start."""
+    WAITING = "waiting"
+    """It has an observation that the policy has not received yet."""
+    ASKED = "asked"
+    """The policy infers."""
+    ACTING = "acting"
+    """A simulator executes actions."""
+    ROLLING_BACK = "rolling_back"
+    """A simulator is rolled back to an earlier state."""
+    OVER = "over"
+    """It has an outcome, or was skipped."""
+
+
+IN_SIMULATOR = (TrialState.HANDING_OFF, TrialState.ACTING, TrialState.ROLLING_BACK)
+"""States that a simulator's reply ends."""
 
 
 class PolicyStateFactory(Interface):

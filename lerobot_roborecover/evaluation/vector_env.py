@@ -28,8 +28,7 @@ from gymnasium.vector.utils import batch_space
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.options import RecoveryOptions
 from lerobot_roborecover.evaluation.session import EvalSession, SimulatorSpec, create_session, scenario_group
-from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.evaluation.trial_state import TrialState
+from lerobot_roborecover.evaluation.trial import Trial, TrialState
 from lerobot_roborecover.logs.row import EvalProtocol, trial_seed
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.action_checks import count_problem

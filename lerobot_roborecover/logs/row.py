@@ -1,4 +1,8 @@
-"""A trial as a line of the log: what the run held fixed, how it ended, and what makes it the same trial."""
+"""A trial as a line of the log: what the run held fixed, how it ended, and what makes it the same trial.
+
+A row names the executed actions by their hash alone. With `--env.record_actions=true` the actions themselves
+lie beside the log (`put_actions`, `read_actions`).
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,23 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 from unicodedata import normalize
+
+import numpy as np
 
 from lerobot_roborecover.logs.fields import MAX_TEXT, TRIAL_SCHEMA
 from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.replay.handoff import Handoff
-from lerobot_roborecover.scenario import Outcome, TrialStart
+from lerobot_roborecover.scenario import Outcome, ScenarioError, TrialStart
+from lerobot_roborecover.utils.atomic_io import atomic_file
+
+ACTIONS_FOLDER = "actions"
+"""Folder beside the log, of files of actions by their hash. A file is there before its row is: the trial can
+then be replayed, forked (`roborecover detect fork`) and exported (`roborecover curate training-data`)."""
+OPTION = "--env.record_actions=true"
+"""What has a run record them."""
 
 
 @dataclass(frozen=True)
@@ -267,3 +281,61 @@ def row_of(record: Mapping[str, Any]) -> TrialRow:
     for name, put in _SETTERS:
         put(row, record[name])
     return row
+
+
+def actions_digest(actions: Iterable[np.ndarray]) -> str:
+    """What a trial row calls `actions_sha256`."""
+    digest = hashlib.sha256()
+    for action in actions:
+        digest.update(np.ascontiguousarray(action).tobytes())
+    return digest.hexdigest()
+
+
+def actions_path(folder: Path, row: TrialRow) -> Path:
+    """File of a trial's actions, by their own hash."""
+    return folder / f"{row.actions_sha256}.npy"
+
+
+def put_actions(folder: Path, actions: np.ndarray, row: TrialRow) -> None:
+    """Puts a trial's actions on disk, where they are not there.
+
+    Args:
+        folder: `actions` beside the log; made if need be.
+        actions: (n, A), those of the row.
+        row: the trial's.
+    """
+    path = actions_path(folder, row)
+    if row.steps and not path.exists():  # trials may have the same actions
+        with atomic_file(path) as file, open(file, "wb") as stream:
+            np.save(stream, actions, allow_pickle=False)
+
+
+def read_actions(folder: Path, row: TrialRow) -> np.ndarray:
+    """A trial's actions, checked against its row.
+
+    Args:
+        folder: `actions` beside the log.
+        row: the trial's.
+
+    Returns:
+        (n, A), of the type that the policy gave: replaying them is exact only in that type. As many as the
+        trial took steps, and those on top that a rollback undid.
+
+    Raises:
+        ScenarioError: they are not there, or are others.
+    """
+    if not row.steps:
+        return np.zeros((0, 0), np.float32)
+    path = actions_path(folder, row)
+    try:
+        # Mapped first: a header may claim any size, and is refused where the file has another.
+        actions = np.array(np.lib.format.open_memmap(path, mode="r"))
+    except (OSError, ValueError, EOFError) as err:
+        raise ScenarioError(
+            f"trial {row.trial} of {row.scenario_id} by {row.policy}: its actions cannot be read ({err}). A "
+            f"log alone cannot be replayed; keep {folder} beside it, or run the policy again with a new log "
+            f"and {OPTION}"
+        ) from None
+    if actions.ndim != 2 or len(actions) < row.steps or actions_digest(actions) != row.actions_sha256:
+        raise ScenarioError(f"{path} does not hold the actions of trial {row.trial} of {row.scenario_id}")
+    return actions

@@ -24,8 +24,7 @@ from lerobot_roborecover.errors import RoboRecoverError, check_seed
 from lerobot_roborecover.platforms import Platform, Simulator, platform_named
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.platforms.probe import answer, last_answer
-from lerobot_roborecover.platforms.simulator import ShowsProgress
-from lerobot_roborecover.platforms.stepping import follow, iter_steps
+from lerobot_roborecover.platforms.simulator import ShowsProgress, follow, iter_steps
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Pose, Reset, Rollout, Task
 
 STEPS = 40

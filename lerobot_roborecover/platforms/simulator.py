@@ -1,15 +1,25 @@
-"""The one protocol behind every platform; everything above the platforms knows only this."""
+"""The one protocol behind every platform, and the one loop that steps a simulator through known actions.
+
+Everything above the platforms knows only the protocol. All replays use the loop:
+
+    for step in iter_steps(simulator, rollout):
+        if step in wanted:
+            seen.append(simulator.observe())
+
+Between two steps the simulator is in the state after `step` actions. There the caller reads what it needs:
+observation, image, poses, predicate, hash. Nothing is rendered unless the caller asks for it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 
 from lerobot_roborecover.errors import RoboRecoverError
-from lerobot_roborecover.scenario import Pose, Reset, Task
+from lerobot_roborecover.scenario import Pose, Reset, Rollout, Task
 
 type Observation = dict[str, Any]
 """LeRobot's raw observation of the platform: nested dicts of arrays, before any processor."""
@@ -109,3 +119,48 @@ class ControlModes(Protocol):
 
     def set_control_mode(self, mode: str) -> None:
         """Reads actions so from now on, until the next reset."""
+
+
+class Steppable(Protocol):
+    """A simulator, or a wrapper of a simulator."""
+
+    def step(self, action: np.ndarray) -> None:
+        """Advances one control step."""
+
+
+def iter_steps(simulator: Simulator, rollout: Rollout, steps: int | None = None) -> Iterator[int]:
+    """Resets a rollout's task and replays its actions.
+
+    Args:
+        simulator: left after the last action that was asked for.
+        rollout: what to replay.
+        steps: so many of its actions; None for all.
+
+    Yields:
+        The number of actions executed so far: 0 after the reset, and the next one after each action.
+    """
+    simulator.reset(rollout.task, rollout.reset)
+    yield from follow(simulator, rollout.actions[:steps])
+
+
+def follow(simulator: Steppable, actions: Iterable[np.ndarray], first: int = 0) -> Iterator[int]:
+    """Executes actions from wherever the simulator stands.
+
+    Args:
+        simulator: left after the last action that was asked for.
+        actions: (A,) each.
+        first: number of the state where it stands.
+
+    Yields:
+        `first`, and the next number after each action.
+    """
+    yield first
+    for step, action in enumerate(actions, first + 1):
+        simulator.step(action)
+        yield step
+
+
+def advance(simulator: Steppable, actions: Iterable[np.ndarray]) -> None:
+    """Executes actions without looking in between."""
+    for _ in follow(simulator, actions):
+        pass

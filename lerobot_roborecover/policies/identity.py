@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER
 
 ADAPTER_FILE = "adapter_config.json"
 NO_RESULT = (

@@ -11,8 +11,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from lerobot_roborecover.policies.action_checks import count_problem
-from lerobot_roborecover.policies.policy_thread import CallStoppedError, CallTimeoutError, PolicyThread
-from lerobot_roborecover.policies.watchdog import hang_reason
+from lerobot_roborecover.policies.watchdog import (
+    CallStoppedError,
+    CallTimeoutError,
+    PolicyThread,
+    hang_reason,
+)
 
 
 class PolicyError(RuntimeError):

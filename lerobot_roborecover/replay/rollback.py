@@ -13,10 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.platforms.simulator import ControlModes, Simulator, SimulatorError
-from lerobot_roborecover.platforms.stepping import advance
-from lerobot_roborecover.replay.handoff import replay_to
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.platforms.simulator import ControlModes, Simulator, SimulatorError, advance
+from lerobot_roborecover.replay.handoff import SnapshotCache, replay_to
 from lerobot_roborecover.scenario import Rollout
 
 

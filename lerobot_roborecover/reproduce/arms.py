@@ -17,8 +17,7 @@ from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.summary import StartSummary, summarise
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.arms import Arm
-from lerobot_roborecover.evaluation.own_log import identity_of_run
+from lerobot_roborecover.evaluation.arms import Arm, identity_of_run
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_log
 from lerobot_roborecover.platforms import platform_named

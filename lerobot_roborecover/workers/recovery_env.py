@@ -20,11 +20,9 @@ from lerobot_roborecover.platforms import (
     platform_named,
     resolve_rewind_steps,
 )
-from lerobot_roborecover.platforms.simulator import ShowsProgress
-from lerobot_roborecover.platforms.stepping import advance
-from lerobot_roborecover.replay.handoff import Handoff, hand_off
+from lerobot_roborecover.platforms.simulator import ShowsProgress, advance
+from lerobot_roborecover.replay.handoff import Handoff, SnapshotCache, hand_off
 from lerobot_roborecover.replay.rollback import RollbackHistory
-from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.scenario import Start, TrialStart
 from lerobot_roborecover.workers.messages import RollbackReply
 

@@ -20,8 +20,15 @@ from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol, cast
 
-from lerobot_roborecover.workers.messages import Command, Reply, Server, SlotConfig, SlotFailure
-from lerobot_roborecover.workers.transport import Channel, make_memory
+from lerobot_roborecover.workers.messages import (
+    Channel,
+    Command,
+    Reply,
+    Server,
+    SlotConfig,
+    SlotFailure,
+    make_memory,
+)
 
 MAX_ATTEMPTS = 3
 """Attempts of an item whose machine is lost; after these the item counts as the cause."""

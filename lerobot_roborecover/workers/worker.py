@@ -1,5 +1,6 @@
 """A simulator worker process: `python -m lerobot_roborecover.workers.worker FD [MEMORY_FD]`, commands in,
-replies out.
+replies out. A `SlotServer` answers them: a simulator that lives for the whole run, and the recovery env of
+the current trial on it.
 
 Started as a fresh interpreter rather than through multiprocessing, whose spawn and forkserver methods import
 the parent's main module again: under `lerobot-eval` that is LeRobot and torch, 15 s and 800 MB a worker.
@@ -10,13 +11,130 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 import traceback
+from dataclasses import replace
 from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.replay.handoff import SnapshotCache
+from lerobot_roborecover.scenario import TrialStart
 from lerobot_roborecover.utils.signals import STOP_SIGNALS
-from lerobot_roborecover.workers.messages import Command, Server, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.messages import (
+    ActResult,
+    Channel,
+    Command,
+    EpisodeSpec,
+    EpisodeStart,
+    Server,
+    SlotConfig,
+    SlotFailure,
+    StepResult,
+)
 from lerobot_roborecover.workers.parent import end_with_parent
-from lerobot_roborecover.workers.transport import Channel
+from lerobot_roborecover.workers.recovery_env import RecoveryEnv
+
+
+class SlotServer:
+    """Answers the commands of one slot.
+
+    Args:
+        config: platform and simulator options.
+    """
+
+    def __init__(self, config: SlotConfig):
+        self._config = config
+        self._simulator = make_simulator(config.platform, **config.options)
+        folder = Path(config.snapshot_dir) if config.snapshot_dir else None
+        self._cache = SnapshotCache(folder=folder, approximate=config.approximate_snapshots)
+        self._env: RecoveryEnv | None = None
+        self._record_video = False
+
+    def answer(self, command: str, argument: Any = None) -> Any:
+        """Runs one command: `spaces`, `reset`, `step`, `act`, `rollback`, `render`, `smoke`, `state` or
+        `fingerprint`."""
+        if command == "spaces":
+            return {"observation_space": self._simulator.observation_space, "hz": self._simulator.control_hz}
+        if command == "reset":
+            return self._reset(argument)
+        if command == "smoke":
+            return self._smoke(argument)
+        if command == "fingerprint":
+            return self._simulator.fingerprint()
+        assert self._env is not None, f"command {command!r} before reset"
+        if command == "step":
+            began = time.perf_counter()
+            observation, _, success, _, _ = self._env.step(argument)
+            seconds = time.perf_counter() - began
+            return StepResult(observation, success, seconds, self._env.progress())
+        if command == "act":
+            return self._act(argument)
+        if command == "rollback":
+            result = self._env.rollback(argument)
+            return replace(result, frame=self._env.render().copy()) if self._record_video else result
+        if command == "render":
+            return self._env.render()
+        if command == "state":
+            return self._simulator.state_sha256()
+        raise ValueError(f"unknown slot command {command!r}")
+
+    def _reset(self, spec: EpisodeSpec) -> EpisodeStart:
+        self._env = RecoveryEnv(
+            spec.scenario,
+            spec.start,
+            spec.rewind_steps,
+            handoff_check=spec.handoff_check,
+            simulator=self._simulator,
+            cache=self._cache,
+            control_mode=self._config.control_mode,
+            rollback_steps=spec.rollback_steps,
+            played=spec.played,
+            spent=spec.spent,
+        )
+        observation, _ = self._env.reset()
+        assert self._env.handoff is not None
+        self._record_video = spec.record_video
+        frame = self._env.render() if spec.record_video else None
+        hz = self._simulator.control_hz
+        return EpisodeStart(observation, self._env.handoff, frame, hz, self._env.progress())
+
+    def _smoke(self, scenario: TrialStart) -> np.ndarray | None:
+        """A picture of the scenario's first state; None where that state cannot be had, which is a trial's
+        own affair."""
+        try:
+            self._simulator.reset(scenario.task, scenario.reset)
+        except Exception:
+            return None
+        return self._simulator.render()
+
+    def _act(self, actions: np.ndarray) -> ActResult:
+        """Executes (n, A) actions, up to success or the horizon; renders at the end alone, and only if it
+        goes on. A trial that records a video renders every step."""
+        assert self._env is not None
+        began = time.perf_counter()
+        success = over = False
+        steps = 0
+        frames, progress = [], []
+        for action in actions:
+            success = self._env.advance(action)
+            steps += 1
+            if self._record_video:
+                frames.append(self._env.render().copy())
+            if (done := self._env.progress()) is not None:
+                progress.append(done)
+            over = success or self._env.out_of_steps
+            if over:
+                break
+        observation = None if over else self._simulator.observe()
+        seconds = time.perf_counter() - began
+        return ActResult(observation, steps, success, over, seconds, tuple(frames), progress=tuple(progress))
+
+    def close(self) -> None:
+        self._simulator.close()
 
 
 def main(fd: int, memory: int | None = None) -> None:
@@ -55,4 +173,7 @@ def main(fd: int, memory: int | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    # The importable copy of this module, which `SlotConfig.server` names, so that each class exists once.
+    from lerobot_roborecover.workers import worker
+
+    worker.main(*map(int, sys.argv[1:]))

@@ -24,8 +24,8 @@ from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+from lerobot_roborecover.platforms.simulator import advance
 from lerobot_roborecover.platforms.starts import parse_numbers
-from lerobot_roborecover.platforms.stepping import advance
 from lerobot_roborecover.scenario import Pose, ScenarioError, Task
 from lerobot_roborecover.web.teleop.client import Client
 from lerobot_roborecover.web.teleop.serve import TeleopConfig

@@ -20,7 +20,7 @@ import numpy as np
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.experts import patient_expert
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.stepping import advance
+from lerobot_roborecover.platforms.simulator import advance
 from lerobot_roborecover.scenario import Reset
 from lerobot_roborecover.utils.journal import plain_records
 from recipes.metaworld.dataset import (

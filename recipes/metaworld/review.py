@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.platforms.metaworld import PLATFORM
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import iter_steps
 from lerobot_roborecover.scenario import Reset, Rollout
 
 _HELD = "the picture shows the object between the fingers"

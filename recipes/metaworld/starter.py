@@ -30,7 +30,7 @@ from lerobot_roborecover.platforms.metaworld.experts import (
     weak_grip_expert,
 )
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
-from lerobot_roborecover.platforms.stepping import advance
+from lerobot_roborecover.platforms.simulator import advance
 from lerobot_roborecover.replay.handoff import with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Source
 from lerobot_roborecover.utils.journal import append_records, plain_records

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
-from lerobot_roborecover.cli.guard import guarded
+from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.utils.options import option
 
 PROGRAM = "python -m recipes.study"

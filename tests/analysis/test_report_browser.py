@@ -14,7 +14,7 @@ from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.pages.gallery import TrialVideo
 from lerobot_roborecover.analysis.pages.report import Extras, write_report
-from lerobot_roborecover.logs.actions import actions_digest, put_actions
+from lerobot_roborecover.logs.row import actions_digest, put_actions
 from tests.support.browser import open_page
 from tests.support.trial_rows import policy_rows, trial_row, write_log
 

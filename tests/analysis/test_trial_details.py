@@ -18,7 +18,7 @@ from lerobot_roborecover.analysis.pages.trial_details import (
     packed,
     packed_within,
 )
-from lerobot_roborecover.logs.actions import actions_digest, put_actions
+from lerobot_roborecover.logs.row import actions_digest, put_actions
 from tests.support.trial_rows import trial_row
 
 

@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from lerobot_roborecover.cli import collect
+from lerobot_roborecover.cli.arguments import renamed
 from lerobot_roborecover.cli.main import command_parser
-from lerobot_roborecover.cli.old_options import renamed
 from lerobot_roborecover.cli.tree import find_call
 from recipes.study import __main__ as study
 from tests.support.option_table import written

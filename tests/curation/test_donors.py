@@ -23,7 +23,7 @@ from lerobot_roborecover.curation.donors import (
 from lerobot_roborecover.curation.funnel import StageCounts
 from lerobot_roborecover.curation.policy_trials import PolicyTrial, read_trials
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError

@@ -32,7 +32,7 @@ from lerobot_roborecover.curation.training.returns import returns_to_go, values
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
 from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_scenario

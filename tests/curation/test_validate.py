@@ -32,7 +32,7 @@ from lerobot_roborecover.curation.validate.validation import (
 )
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.frames import LastFrames, encode_png, last_frames
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Pose, ScenarioError

@@ -15,9 +15,9 @@ from lerobot_roborecover.curation.candidates_write import Recording, write_candi
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import iter_steps
 from tests.support.trial_rows import trial_row
 
 SIDE, STEPS, POINT = 96, 40, 25

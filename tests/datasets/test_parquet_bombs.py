@@ -21,7 +21,7 @@ from lerobot_roborecover.datasets.contents import check_file
 from lerobot_roborecover.datasets.episodes import EXACT_ACTION, SCENARIO_INDEX
 from lerobot_roborecover.datasets.parquet_read import read_numbers, read_table
 from lerobot_roborecover.datasets.schema import FOLDER, RESET_OPTIONS, SCHEMA
-from lerobot_roborecover.logs.actions import actions_path, read_actions
+from lerobot_roborecover.logs.row import actions_path, read_actions
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_dataset
 from tests.support.memory import peak_bytes

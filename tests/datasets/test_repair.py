@@ -12,11 +12,11 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import load_scenarios
+from lerobot_roborecover.datasets.files import PENDING
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.repair import repair
 from lerobot_roborecover.datasets.trajectories import read_exact, read_trajectories
 from lerobot_roborecover.datasets.trajectory_write import write_trajectories
-from lerobot_roborecover.datasets.update import PENDING
 from lerobot_roborecover.datasets.write import write_episodes
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError

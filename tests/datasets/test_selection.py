@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_roborecover.datasets.load import ScenarioSet
-from lerobot_roborecover.datasets.select import validate_for
+from lerobot_roborecover.datasets.load import ScenarioSet, validate_for
 from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
 
 

@@ -18,10 +18,10 @@ from lerobot_roborecover.curation.split import SplitConfig
 from lerobot_roborecover.curation.split_dataset import check_splits, split_dataset
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.contents import list_files
+from lerobot_roborecover.datasets.files import PENDING, finish_update, update_folder
 from lerobot_roborecover.datasets.frame_files import FrameStore
 from lerobot_roborecover.datasets.frames import last_frames
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE, SCENARIOS_FILE
-from lerobot_roborecover.datasets.update import PENDING, finish_update, update_folder
 from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import ScenarioError

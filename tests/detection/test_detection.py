@@ -178,7 +178,7 @@ def forks(dataset, policy, tmp_path_factory) -> Path:
     from lerobot_roborecover.detection.forks.arms import ForkArm
     from lerobot_roborecover.detection.forks.parents import LoggedTrial
     from lerobot_roborecover.detection.forks.trial import Fork
-    from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_path
+    from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_path
     from lerobot_roborecover.policies.identity import policy_identity
 
     folder = tmp_path_factory.mktemp("forks")

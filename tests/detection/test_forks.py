@@ -13,8 +13,7 @@ from lerobot_roborecover.detection.forks.arms import ForkArm, parse_arm
 from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, usable
 from lerobot_roborecover.detection.forks.trial import ANOTHER, OWN, Fork, ForkTrial, TeacherForcedRunner
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_digest, read_actions
-from lerobot_roborecover.logs.row import EvalProtocol
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, EvalProtocol, actions_digest, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.replay.rollback import RollbackHistory

@@ -210,7 +210,7 @@ def test_the_command_runs_policies_once_and_goes_on_where_it_stopped(tmp_path, c
     """Through the local engine; recorded actions are those that the log has the hash of."""
     from lerobot_roborecover.cli.main import main
     from lerobot_roborecover.curation import policy_trials
-    from lerobot_roborecover.logs import actions
+    from lerobot_roborecover.logs.row import actions_path
 
     scenarios = [replace(fake_scenario(i, horizon=14), split="train" if i < 5 else "test") for i in range(6)]
     root = write_scenarios(tmp_path / "set", scenarios)
@@ -264,7 +264,7 @@ def test_the_command_runs_policies_once_and_goes_on_where_it_stopped(tmp_path, c
     assert sum(kept.get(t.row.scenario_id) == t.actions.tobytes() for t in again) == 2
     assert all(t.actions.shape == (t.row.steps, 2) and t.actions.dtype == np.float32 for t in again)
     # A log whose actions are gone, or are others, says so.
-    path = actions.actions_path(folder / "actions", again[0].row)
+    path = actions_path(folder / "actions", again[0].row)
     np.save(path, again[0].actions + 1)
     with pytest.raises(ScenarioError, match="does not hold the actions"):
         policy_trials.read_trials(folder)

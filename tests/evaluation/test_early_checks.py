@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.config_help import help_text, shown_options
+from lerobot_roborecover.cli.config_command import help_text, shown_options
 from lerobot_roborecover.cli.eval import SOURCE
 from lerobot_roborecover.evaluation.early_checks import env_class, join_values, policy_types
 from lerobot_roborecover.platforms.env_options import NOT_OPTIONS

@@ -18,7 +18,7 @@ from lerobot_roborecover.evaluation.work_items import units_of
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.interventions.control_columns import SIGNATURE
 from lerobot_roborecover.policies.metadata import PolicyMetadata
-from lerobot_roborecover.policies.policy_thread import CallTimeoutError, PolicyThread
+from lerobot_roborecover.policies.watchdog import CallTimeoutError, PolicyThread
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.workers.messages import SlotConfig
 from tests.evaluation.test_local_engine import PushHost
@@ -185,9 +185,9 @@ HUNG_COMMAND = """
     from concurrent.futures import ThreadPoolExecutor
     from lerobot_roborecover.cli import eval as command
     from lerobot_roborecover.cli.main import main
-    from lerobot_roborecover.policies import policy_thread
+    from lerobot_roborecover.policies import watchdog
 
-    policy_thread._LOCK_GRACE_S = 1.0
+    watchdog._LOCK_GRACE_S = 1.0
 
     def wait_for_another_thread():
         ThreadPoolExecutor(1).submit(threading.Event().wait).result()
@@ -196,10 +196,10 @@ HUNG_COMMAND = """
         ctypes.PyDLL(None).pause()
 
     def run(argv):
-        thread = policy_thread.PolicyThread()
+        thread = watchdog.PolicyThread()
         try:
             thread.call({hang}, limit_s=1.0)
-        except policy_thread.CallTimeoutError:
+        except watchdog.CallTimeoutError:
             print("written")
         thread.close()
         return 1
@@ -242,7 +242,7 @@ HUNG_LOOP = """
         return push_policy(observation)
 
     from lerobot_roborecover.policies import watchdog
-    watchdog._GRACE_S = 2.0
+    watchdog._INTERRUPT_S = 2.0
     evaluate(sys.argv[1], sys.argv[2], trials=2, batch=2, workers=True, policy_watchdog_s=5.0, policy=policy)
 """
 

@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_roborecover.curation.screen.runs import PolicySpec, run_policy, take_trials
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.evaluation.own_log import claim_log, identity_of_run
+from lerobot_roborecover.evaluation.arms import claim_log, identity_of_run
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
 from recipes.study.arms import arms

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Trial
-from lerobot_roborecover.evaluation.trial_state import TrialState
+from lerobot_roborecover.evaluation.trial import SOLVED_THERE, Trial, TrialState
 from lerobot_roborecover.logs.row import EvalProtocol
 from lerobot_roborecover.policies.runner import Act, Controller, InterventionMark, Rollback
 from lerobot_roborecover.replay.handoff import Handoff

@@ -18,7 +18,7 @@ import yaml
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms import platform_named, platform_names
 from lerobot_roborecover.platforms.check import CheckRequest, check_platform
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import iter_steps
 from lerobot_roborecover.platforms.versions import installed
 from lerobot_roborecover.scenario import Reset
 

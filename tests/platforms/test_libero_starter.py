@@ -12,8 +12,7 @@ import lerobot_roborecover
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms.libero import PLATFORM
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS
-from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.scenario import Reset, Scenario, Source
 from tests.support.exactness import as_recorded
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
-from lerobot_roborecover.replay.handoff import hand_off, with_fingerprint
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off, with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Task
 
 pytestmark = pytest.mark.metaworld

@@ -12,8 +12,7 @@ import pytest
 
 from lerobot_roborecover.datasets import read_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.scenario import Start
 from tests.support.exactness import as_recorded
 

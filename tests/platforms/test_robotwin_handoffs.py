@@ -12,8 +12,7 @@ import pytest
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets import write_scenarios
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay.handoff import Handoff, hand_off, with_fingerprint
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import Handoff, SnapshotCache, hand_off, with_fingerprint
 from lerobot_roborecover.scenario import Reset, Scenario, Task
 from tests.support.robotwin_checkouts import ROOT, can_render, on_real, on_standin, run_fresh
 
@@ -227,7 +226,7 @@ import numpy as np
 from pathlib import Path
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache
 from lerobot_roborecover.platforms import make_simulator
 scenario = load_scenarios({str(tmp_path / "set")!r})[0]
 simulator = make_simulator("robotwin", robotwin_root={ROOT!r}, obs_type="state")

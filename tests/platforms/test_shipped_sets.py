@@ -12,8 +12,7 @@ import pytest
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.datasets.load import builtin_names, validate_for
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.replay.handoff import hand_off
-from lerobot_roborecover.replay.snapshots import SnapshotCache
+from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.scenario import Start
 from tests.support.exactness import PINNED, as_recorded, states_in_a_fresh_process
 

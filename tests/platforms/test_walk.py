@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_roborecover.curation.rollout import record
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.stepping import advance, follow, iter_steps
+from lerobot_roborecover.platforms.simulator import advance, follow, iter_steps
 from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, Recorder
 from lerobot_roborecover.scenario import Reset, Rollout, Task
 

@@ -135,7 +135,7 @@ def load(folder: Path, **changes):
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
-    from lerobot_roborecover.evaluation.processors import env_processors
+    from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
     from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 
     config = PreTrainedConfig.from_pretrained(folder)
@@ -269,7 +269,7 @@ def robotwin_host(folder: Path, rename: dict | None = None, **options):
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
-    from lerobot_roborecover.evaluation.processors import env_processors
+    from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
     from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 
     env = ENV_TYPES["robotwin"](**options)
@@ -341,7 +341,7 @@ def test_x_vlas_rotations_survive_the_way_there_and_back():
 
 def test_fast_wam_sees_all_cameras_in_one_picture():
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
-    from lerobot_roborecover.evaluation.processors import env_processors
+    from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
 
     env = ENV_TYPES["robotwin"](mosaic=True)
     assert env.features["pixels/mosaic"].shape == (384, 320, 3)

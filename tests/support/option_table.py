@@ -12,8 +12,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.cli.arguments import OldName
 from lerobot_roborecover.cli.main import build_parser, command_parser
-from lerobot_roborecover.cli.old_options import OldName
 from lerobot_roborecover.cli.tree import GROUPS, SPLIT_NAMES, find_call
 from recipes.study import __main__ as study
 
@@ -46,9 +46,8 @@ def lerobots_options() -> dict[str, Options]:
     """By command, or by what is chosen: options of ours that LeRobot's parser reads, not LeRobot's own."""
     from lerobot_roborecover.evaluation.check_policy import CheckOptions
     from lerobot_roborecover.evaluation.env_configs import ENV_TYPES
-    from lerobot_roborecover.evaluation.options import RecoveryOptions
+    from lerobot_roborecover.evaluation.options import ALIASES, JSON, RecoveryOptions
     from lerobot_roborecover.evaluation.runner import RunnerOptions
-    from lerobot_roborecover.evaluation.short_names import ALIASES, JSON
     from lerobot_roborecover.platforms.registry import ENV_PREFIX
     from lerobot_roborecover.policies import ema
     from lerobot_roborecover.policies.detectors.monitor import (

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_roborecover.curation.policy_trials import PolicyTrial
-from lerobot_roborecover.logs.actions import actions_digest
-from lerobot_roborecover.logs.row import EvalProtocol, make_row
+from lerobot_roborecover.logs.row import EvalProtocol, actions_digest, make_row
 from lerobot_roborecover.platforms import make_simulator, platform_named
-from lerobot_roborecover.platforms.stepping import advance
+from lerobot_roborecover.platforms.simulator import advance
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, Scenario
 

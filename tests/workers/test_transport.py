@@ -11,9 +11,8 @@ from multiprocessing.connection import Connection
 import numpy as np
 import pytest
 
-from lerobot_roborecover.workers import slots, transport
-from lerobot_roborecover.workers.messages import EpisodeSpec, SlotConfig
-from lerobot_roborecover.workers.transport import MEMORY_BYTES, Channel, make_memory
+from lerobot_roborecover.workers import messages, slots
+from lerobot_roborecover.workers.messages import MEMORY_BYTES, Channel, EpisodeSpec, SlotConfig, make_memory
 from tests.support.factories import fake_scenario
 
 
@@ -138,5 +137,5 @@ def _plain(value):
 
 def test_a_system_without_such_memory_is_none_the_worse(monkeypatch):
     """Without `memfd_create` the socket is used."""
-    monkeypatch.delattr(transport.os, "memfd_create", raising=False)
+    monkeypatch.delattr(messages.os, "memfd_create", raising=False)
     assert make_memory() is None

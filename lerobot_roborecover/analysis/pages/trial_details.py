@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.pages.page import without_folders
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import ScenarioError
 

@@ -11,8 +11,7 @@ from lerobot_roborecover.curation.collect.record import record_path
 from lerobot_roborecover.curation.collect.server import RolloutResult
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.evaluation.trial_state import FAILURES
+from lerobot_roborecover.evaluation.trial import FAILURES, Trial
 from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow
 from lerobot_roborecover.scenario import Outcome, ScenarioError

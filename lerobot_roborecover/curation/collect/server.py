@@ -13,11 +13,11 @@ from lerobot_roborecover.curation.collect.experts import make_controller
 from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator, pack_record
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.platforms import Observation, Simulator
+from lerobot_roborecover.platforms.simulator import advance, iter_steps
 from lerobot_roborecover.platforms.starts import stream
-from lerobot_roborecover.platforms.stepping import advance, iter_steps
 from lerobot_roborecover.scenario import Outcome, Rollout, TrialStart
 from lerobot_roborecover.workers.messages import ActResult, EpisodeSpec, EpisodeStart, InProgress, SlotConfig
-from lerobot_roborecover.workers.slot_server import SlotServer
+from lerobot_roborecover.workers.worker import SlotServer
 
 SERVER = f"{__name__}:CollectServer"
 REPLY_EVERY_S = 5.0

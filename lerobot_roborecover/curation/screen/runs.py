@@ -24,7 +24,7 @@ from lerobot_roborecover.curation.policy_trials import (
     run_trials,
 )
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_path
 from lerobot_roborecover.logs.trial_log import TrialLog, check_retry
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_file, atomic_write

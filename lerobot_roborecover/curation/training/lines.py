@@ -13,8 +13,7 @@ import numpy as np
 from lerobot_roborecover.analysis.stats.fork_gain import MATCHED, note_of
 from lerobot_roborecover.curation.continuations import from_rollouts
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import Outcome, Scenario

@@ -18,7 +18,7 @@ from lerobot_roborecover.curation.validate.sheets import draw_sheet
 from lerobot_roborecover.curation.validate.validation import CRASH, INVALID_ACTION, Replays, RunReplay
 from lerobot_roborecover.datasets.frames import KEPT, camera_pictures
 from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator
-from lerobot_roborecover.platforms.stepping import Steppable, follow
+from lerobot_roborecover.platforms.simulator import Steppable, follow
 from lerobot_roborecover.scenario import Pose, Scenario, ScenarioError
 
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.stats.fork_gain import FORK
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, read_actions
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
 from lerobot_roborecover.utils.options import option

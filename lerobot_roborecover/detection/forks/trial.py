@@ -22,8 +22,7 @@ from lerobot_roborecover.detection.forks.arms import ForkArm
 from lerobot_roborecover.detection.forks.parents import LoggedTrial
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import PolicyStateFactory, Trial
-from lerobot_roborecover.logs.actions import ACTIONS_FOLDER, put_actions
-from lerobot_roborecover.logs.row import EvalProtocol, TrialRow, trial_seed
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, EvalProtocol, TrialRow, put_actions, trial_seed
 from lerobot_roborecover.policies.runner import (
     Act,
     Decision,

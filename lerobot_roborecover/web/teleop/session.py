@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.simulator import Simulator
-from lerobot_roborecover.platforms.stepping import follow
+from lerobot_roborecover.platforms.simulator import Simulator, follow
+from lerobot_roborecover.replay.handoff import SnapshotCache
 from lerobot_roborecover.replay.recorder import Recorder
 from lerobot_roborecover.replay.rollback import RollbackHistory
-from lerobot_roborecover.replay.snapshots import SnapshotCache
 from lerobot_roborecover.rollout import MAX_PREFIX_STEPS
 from lerobot_roborecover.scenario import DeviationType, Pose, ScenarioError, Stage
 from lerobot_roborecover.web.teleop.starts import StartPoint

@@ -22,7 +22,7 @@ from lerobot_roborecover.curation.video_settings import VideoSettings
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.platforms import Simulator, make_simulator
-from lerobot_roborecover.platforms.stepping import iter_steps
+from lerobot_roborecover.platforms.simulator import iter_steps
 from lerobot_roborecover.replay.recorder import UNPERTURBED, Steps
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, ScenarioError, Source
 from lerobot_roborecover.utils.atomic_io import atomic_dir
