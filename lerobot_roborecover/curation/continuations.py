@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_roborecover.curation.policy_trials import PolicyTrial
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
+from lerobot_roborecover.logs.row import LoggedTrial
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 
@@ -31,7 +31,7 @@ class Continuation:
 
 
 def from_trials(
-    trials: Iterable[PolicyTrial], scenarios: Mapping[str, Scenario], dropped: Counter
+    trials: Iterable[LoggedTrial], scenarios: Mapping[str, Scenario], dropped: Counter
 ) -> list[Continuation]:
     """Continuations from recorded trials; what cannot be used is counted in `dropped` by its reason."""
     found = []

@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.funnel import StageCounts
-from lerobot_roborecover.curation.policy_trials import PolicyTrial, check_repeats
+from lerobot_roborecover.curation.policy_trials import check_repeats
 from lerobot_roborecover.datasets.rendered_steps import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 from lerobot_roborecover.utils.options import option
 from lerobot_roborecover.utils.text import pluralize
@@ -86,11 +86,11 @@ class Donor:
     """A candidate that passed its four trials."""
 
     candidate: DonorCandidate
-    trials: tuple[PolicyTrial, ...]
+    trials: tuple[LoggedTrial, ...]
     """All of them, by index."""
 
     @property
-    def successes(self) -> list[PolicyTrial]:
+    def successes(self) -> list[LoggedTrial]:
         return [t for t in self.trials if t.row.success]
 
 
@@ -169,7 +169,7 @@ def choose_candidates(
 
 def judge(
     candidates: Iterable[DonorCandidate],
-    trials: Iterable[PolicyTrial],
+    trials: Iterable[LoggedTrial],
     options: DonorOptions,
     funnel: list[StageCounts],
 ) -> list[Donor]:
@@ -184,7 +184,7 @@ def judge(
     Raises:
         ScenarioError: two trials of a policy that is said to be deterministic differ.
     """
-    of: dict[tuple[str, str], dict[int, PolicyTrial]] = defaultdict(dict)
+    of: dict[tuple[str, str], dict[int, LoggedTrial]] = defaultdict(dict)
     for trial in trials:
         if trial.row.start == Start.RECOVERY.value and not trial.row.interventions:
             of[trial.row.scenario_sha256, trial.row.policy].setdefault(trial.row.trial, trial)
@@ -218,7 +218,7 @@ def source_record(scenario: Scenario) -> str:
 
 def deduplicate(
     donors: Iterable[Donor], options: DonorOptions, funnel: list[StageCounts]
-) -> list[tuple[Donor, PolicyTrial]]:
+) -> list[tuple[Donor, LoggedTrial]]:
     """At most `per_record` trajectories of each source record, none of them twice.
 
     The donor with the most successes goes first, then the one with the better rate, then the quicker one.
@@ -232,7 +232,7 @@ def deduplicate(
         seen: set[str] = set()
         for donor in group:
             fresh = [t for t in donor.successes if t.row.actions_sha256 not in seen]
-            taken: list[PolicyTrial] = []
+            taken: list[LoggedTrial] = []
             for trial in fresh:
                 if len(seen) < options.per_record and trial.row.actions_sha256 not in seen:
                     seen.add(trial.row.actions_sha256)
@@ -257,7 +257,7 @@ def _preference(donor: Donor) -> tuple:
 
 def write_donors(
     root: Path,
-    chosen: Sequence[tuple[Donor, PolicyTrial]],
+    chosen: Sequence[tuple[Donor, LoggedTrial]],
     *,
     simulator: Mapping[str, Any],
     workers: int,
@@ -320,12 +320,12 @@ def write_donors(
     return len(chosen) - dropped.total()
 
 
-def _job(donor: Donor, trial: PolicyTrial) -> RenderJob:
+def _job(donor: Donor, trial: LoggedTrial) -> RenderJob:
     t = len(donor.candidate.scenario.prefix)
     return RenderJob(donor.candidate.scenario, trial.actions, np.arange(t, t + len(trial.actions)))
 
 
-def _problem(replay: RenderedSteps, trial: PolicyTrial) -> str:
+def _problem(replay: RenderedSteps, trial: LoggedTrial) -> str:
     if not replay.succeeded:
         return "whose replay does not succeed"
     if len(replay.observations) != len(trial.actions):
@@ -333,7 +333,7 @@ def _problem(replay: RenderedSteps, trial: PolicyTrial) -> str:
     return ""
 
 
-def _trajectory(donor: Donor, trial: PolicyTrial, frames: list) -> Trajectory:
+def _trajectory(donor: Donor, trial: LoggedTrial, frames: list) -> Trajectory:
     candidate = donor.candidate
     scenario = candidate.scenario
     return Trajectory(

@@ -9,12 +9,9 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from lerobot_roborecover.evaluation.early_checks import check_env_options
 from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
@@ -22,7 +19,7 @@ from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
 from lerobot_roborecover.evaluation.work_items import unfinished, units_of
 from lerobot_roborecover.logs.policy_settings import digest_of
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, put_actions, read_actions
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, put_actions, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.policies.metadata import policy_metadata
@@ -36,15 +33,6 @@ if TYPE_CHECKING:
 TRIALS_FILE = "trials.jsonl"
 CURRENT_FILE = "current.json"
 """Which of the log's rows are those of the last run: the others are of other files, options or seeds."""
-
-
-@dataclass(frozen=True)
-class PolicyTrial:
-    """A finished trial and what was executed in it."""
-
-    row: TrialRow
-    actions: np.ndarray
-    """(steps, A), of the type that the policy gave: replaying them is exact only in that type."""
 
 
 def run_trials(
@@ -63,7 +51,7 @@ def run_trials(
     policy_options: Sequence[str] = (),
     rename_map: Mapping[str, str] | None = None,
     on_row: Callable[[TrialRow, int, int], None] = lambda row, done, total: None,
-) -> list[PolicyTrial]:
+) -> list[LoggedTrial]:
     """Runs what the folder does not hold yet, and returns everything.
 
     Args:
@@ -114,7 +102,11 @@ def run_trials(
             on_row=lambda row: on_row(row, next(done), len(units)),
         ).check_all_run()  # fmt: skip
         rows = {r.key(): r for r in run.require_log().rows}
-    return [_with_actions(rows[key], folder / ACTIONS_FOLDER) for key in keys if key in rows]
+    return [
+        LoggedTrial(rows[key], read_actions(folder / ACTIONS_FOLDER, rows[key]))
+        for key in keys
+        if key in rows
+    ]
 
 
 def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
@@ -132,7 +124,7 @@ def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
             )
 
 
-def read_trials(folder: Path) -> list[PolicyTrial]:
+def read_trials(folder: Path) -> list[LoggedTrial]:
     """Trials that `run_trials` left in a folder: those of its last run's policy, options and seed.
 
     Raises:
@@ -153,7 +145,7 @@ def read_trials(folder: Path) -> list[PolicyTrial]:
             f"{folder} holds trials of {len(kinds)} policies, or of one under several settings, which would "
             f"be mixed. Keep one in it, or name folders that hold one each"
         )
-    return [_with_actions(row, folder / ACTIONS_FOLDER) for row in rows]
+    return [LoggedTrial(row, read_actions(folder / ACTIONS_FOLDER, row)) for row in rows]
 
 
 def env_config(platform: str, scenarios: str, options: Sequence[str] = ()) -> RecoveryEnvConfig:
@@ -200,7 +192,3 @@ def _keep_actions(folder: Path, trial: Trial, row: TrialRow) -> None:
             "policy"
         )
     put_actions(folder, trial.actions, row)
-
-
-def _with_actions(row: TrialRow, folder: Path) -> PolicyTrial:
-    return PolicyTrial(row, read_actions(folder, row))

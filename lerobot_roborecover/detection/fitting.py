@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from lerobot_roborecover.datasets.lerobot_folder import check_lerobot_folder, open_lerobot_folder
-from lerobot_roborecover.detection.forked import SeenForks
+from lerobot_roborecover.detection.forked import ForkedTrial
 from lerobot_roborecover.detection.scoring import PolicySignals
 from lerobot_roborecover.detection.trials import ReplayedTrial
 from lerobot_roborecover.policies.detectors.interface import DetectorError, DetectorNeeds
@@ -144,7 +144,9 @@ def fit_features(
 
 
 def fit_gain(
-    detector: RoboRecoverRecoveryGainRewardModel, forks: Sequence[SeenForks], looks: PolicySignals
+    detector: RoboRecoverRecoveryGainRewardModel,
+    forks: Sequence[tuple[ReplayedTrial, ForkedTrial]],
+    looks: PolicySignals,
 ) -> str:
     """Fits the detector to the gains of interventions in forked trials.
 
@@ -160,13 +162,13 @@ def fit_gain(
         DetectorError: the intervention rescued no trial.
     """
     features, gains = [], []
-    for forked in forks:
-        steps = looks.of(forked.trial, DetectorNeeds(internals=True))[-1]
+    for trial, forked in forks:
+        steps = looks.of(trial, DetectorNeeds(internals=True))[-1]
         for step, gain in forked.gains.items():
             features.append(steps[step][1])
             gains.append(gain)
     detector.fit(torch.stack(features), torch.tensor(gains))
-    _remember(detector, [f.trial for f in forks])
+    _remember(detector, [trial for trial, _ in forks])
     counts: Mapping[str, int] = detector.config.labels
     return (
         f"{len(gains)} forks of {len(forks)} trials: {counts['rescued']} rescued, {counts['harmed']} harmed, "

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.stats.fork_gain import ForkPair, fork_gains
-from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial
+from lerobot_roborecover.curation.policy_trials import TRIALS_FILE
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
 from lerobot_roborecover.detection.trials import ReplayedTrial, TrialSource, look_at
 from lerobot_roborecover.logs.policy_settings import digest_of
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.detectors.interface import DetectorError
 from lerobot_roborecover.scenario import ScenarioError
@@ -46,15 +46,6 @@ class ForkLog:
         """Scenarios of the trials."""
         shas = {t.row.scenario_id: t.row.scenario_sha256 for t in self.trials}
         return [ScenarioLink(i, sha, "") for i, sha in shas.items()]
-
-
-@dataclass(frozen=True)
-class SeenForks:
-    """A forked trial and what it showed."""
-
-    trial: ReplayedTrial
-    gains: Mapping[int, float]
-    """As of `ForkedTrial`."""
 
 
 def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
@@ -100,7 +91,7 @@ def read_forks(log: Path, policy: str, arm: str = "") -> ForkLog:
 
 def see_forks(
     log: ForkLog, source: TrialSource, env_batch: Any, progress: Callable[[str, int, int], None]
-) -> list[SeenForks]:
+) -> list[tuple[ReplayedTrial, ForkedTrial]]:
     """Replays forked trials to see what they showed.
 
     Args:
@@ -120,14 +111,14 @@ def see_forks(
                 f"--forks {log.path}: {link.id} is not in {source.scenarios} as it was forked; fork trials "
                 "of this set"
             )
-    found = []
+    found: list[tuple[ReplayedTrial, ForkedTrial]] = []
     for start in sorted({t.row.start for t in log.trials}):
         mine = [t for t in log.trials if t.row.start == start]
         options = source.env_config(scenarios.platform, "", start).run_spec().slot.options
         folder = log.path.with_name(ACTIONS_FOLDER)
-        played = [(by_id[t.row.scenario_id], PolicyTrial(t.row, read_actions(folder, t.row))) for t in mine]
+        played = [(by_id[t.row.scenario_id], LoggedTrial(t.row, read_actions(folder, t.row))) for t in mine]
         seen = look_at(played, scenarios.platform, options, source, env_batch, f"forks, {start}", progress)
-        found += [SeenForks(trial, t.gains) for trial, t in zip(seen, mine, strict=True)]
+        found += zip(seen, mine, strict=True)
     return found
 
 

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, run_trials
+from lerobot_roborecover.curation.policy_trials import env_config, run_trials
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.rendered_steps import RenderJob, replayed
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.scenario import Outcome, Scenario
 from lerobot_roborecover.utils.atomic_io import atomic_file
@@ -69,19 +69,19 @@ class TrialSource:
 
 
 @dataclass(frozen=True)
-class ReplayedTrial:
-    """A trial and what its steps showed."""
+class ReplayedTrial(LoggedTrial):
+    """A trial and what its steps showed: far too large to be kept for trials that nobody watches."""
 
-    row: TrialRow
     scenario: Scenario
-    actions: np.ndarray
-    """(steps, A) of the policy."""
-    handoff: int
-    """Actions replayed before the policy took over."""
     control_hz: float
     observations: Mapping[str, np.ndarray]
     """(T, ...) by LeRobot key, as they leave the env preprocessor, of each step before its action, replayed
     ones first; pictures (T, 3, H, W) uint8."""
+
+    @property
+    def handoff(self) -> int:
+        """Actions replayed before the policy took over."""
+        return self.row.handoff_step
 
     @property
     def unit(self) -> str:
@@ -143,7 +143,7 @@ def replay_trials(
 
 
 def look_at(
-    trials: Sequence[tuple[Scenario, PolicyTrial]],
+    trials: Sequence[tuple[Scenario, LoggedTrial]],
     platform: str,
     options: Mapping[str, Any],
     source: TrialSource,
@@ -189,11 +189,7 @@ def look_at(
     for (scenario, trial), file in zip(trials, files, strict=True):
         with np.load(file, allow_pickle=False) as saved:
             observations = {key: saved[key] for key in saved.files}
-        made.append(
-            ReplayedTrial(
-                trial.row, scenario, trial.actions, trial.row.handoff_step, control_hz, observations
-            )
-        )
+        made.append(ReplayedTrial(trial.row, trial.actions, scenario, control_hz, observations))
     return made
 
 

@@ -21,24 +21,15 @@ _KINDS = {Controller.CORRECTION: "correction", Controller.HUMAN: "takeover"}
 
 
 @dataclass
-class _Monitor:
-    calls: int = 0
-    unparsable: int = 0
-    seconds: float = 0.0
-    score: float = float("nan")
-    """The last one; of the trigger, once there is one."""
-    highest: float = float("nan")
-    step: int | None = None
-    """Step of the trigger."""
-
-
-@dataclass
 class InterventionRecord:
-    """Follows one trial. `steps` are always new environment steps taken so far, undone ones included."""
+    """Follows one trial: the row's interventions alone, apart from `Trial`, which counts the rest. `steps`
+    are always new environment steps taken so far, undone ones included."""
 
     undone: int = 0
     """Steps of the policy that rollbacks threw away."""
-    _monitor: _Monitor = field(default_factory=_Monitor)
+    _monitor: dict[str, Any] = field(default_factory=dict)
+    """The row's entry of the monitor; empty until it is asked. `step` is that of the trigger, `score` the
+    last one up to the trigger."""
     _entries: list[dict[str, Any]] = field(default_factory=list)
     _controller: Controller = Controller.BASE
     _solved: bool = False
@@ -49,8 +40,8 @@ class InterventionRecord:
         by = "schedule"
         if mark.asked:
             self._heard(mark)
-            if (back or changes) and self._monitor.step is None:
-                self._monitor.step, by = steps, "monitor"
+            if (back or changes) and self._monitor["step"] is None:
+                self._monitor["step"], by = steps, "monitor"
         if isinstance(decision, Rollback):
             asked = BY_RULE if decision.steps is None else decision.steps
             self._entries.append({"kind": "rollback", "step": steps, "by": by, "asked": asked})
@@ -60,15 +51,19 @@ class InterventionRecord:
         self._controller = mark.controller
 
     def _heard(self, mark: InterventionMark) -> None:
-        told = self._monitor
-        told.calls += 1
-        told.seconds += mark.monitor_s
+        told = self._monitor = self._monitor or {
+            "kind": "monitor", "step": None, "calls": 0, "unparsable": 0,
+            "score": None, "highest_score": None, "seconds": 0.0,
+        }  # fmt: skip
+        told["calls"] += 1
+        told["seconds"] += mark.monitor_s
         if math.isnan(mark.score):
-            told.unparsable += 1
+            told["unparsable"] += 1
             return
-        if told.step is None:
-            told.score = mark.score
-        told.highest = max(mark.score, mark.score if math.isnan(told.highest) else told.highest)
+        if told["step"] is None:
+            told["score"] = mark.score
+        highest = told["highest_score"]
+        told["highest_score"] = mark.score if highest is None else max(mark.score, highest)
 
     def acted(self, controller: Controller, steps: int) -> None:
         """Counts executed actions for the controller that chose them."""
@@ -89,15 +84,11 @@ class InterventionRecord:
         """Takes in what was done to the trial from outside; has at least `kind` and `step`."""
         self._entries.append(entry)
 
-    def budget(self, horizon: int) -> int:
-        """Steps after which the trial ends: S, and as many as were undone."""
-        return horizon + self.undone
-
     def verdict(self, steps: int, horizon: int) -> tuple[Outcome, int]:
         """Outcome and counted steps of a trial that was solved, or that used its budget up.
 
         Args:
-            steps: at which it was solved; `budget` or more where it was not.
+            steps: at which it was solved; S and as many as were undone, or more, where it was not.
             horizon: S.
         """
         solved = self._solved
@@ -113,21 +104,11 @@ class InterventionRecord:
         self._solved = True
 
     def entries(self) -> list[dict[str, Any]]:
-        """The row's `interventions`, the monitor's account first."""
-        told = self._monitor
-        if not told.calls:
+        """The row's `interventions`, the monitor's entry first."""
+        if not self._monitor:
             return list(self._entries)
-        account = {
-            "kind": "monitor",
-            "step": told.step,
-            "calls": told.calls,
-            "unparsable": told.unparsable,
-            "score": _json(told.score),
-            "highest_score": _json(told.highest),
-            "seconds": round(told.seconds, 4),
+        digits = {"score": 6, "highest_score": 6, "seconds": 4}
+        monitor = {
+            k: v if v is None else round(v, digits[k]) if k in digits else v for k, v in self._monitor.items()
         }
-        return [account, *self._entries]
-
-
-def _json(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 6)
+        return [monitor, *self._entries]

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from lerobot_roborecover.evaluation.active_trial import ActiveTrial, WorkerState
 from lerobot_roborecover.evaluation.batching import BatchTimer
 from lerobot_roborecover.evaluation.first_trials import FirstTrials
 from lerobot_roborecover.evaluation.session import EvalSession
-from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.evaluation.videos import VideoRecorder
+from lerobot_roborecover.evaluation.trial import Trial, TrialState
+from lerobot_roborecover.evaluation.videos import VideoRecorder, VideoWriter
 from lerobot_roborecover.evaluation.work_items import WorkItem, WorkQueue, unfinished
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.policies.action_checks import count_problem
@@ -45,6 +45,30 @@ type Waiter = Callable[[list[Any], float], Collection[Any]]
 """Waits for any of the handles, at most the given seconds; returns those that are ready."""
 type Event = tuple[Replica | SimulatorWorker, Callable[[], None]]
 """A connection to wait for, and the action when it is ready."""
+
+
+@dataclass(eq=False)
+class ActiveTrial:
+    """A trial that runs in a slot. Apart from `Trial`, which has no clock, process or file."""
+
+    slot: SimulatorWorker
+    unit: WorkItem[TrialStart]
+    trial: Trial
+    """Trial of `unit`."""
+    replica: Replica | None
+    """The replica that has the trial's history; None once that is lost."""
+    history: Any
+    waiting_since: float = 0.0
+    answered_at: float | None = None
+    """When the policy last answered, on the engine's clock; None before the first time."""
+    answered_with: int = 0
+    """Trials that were answered then."""
+    recording: VideoWriter | None = None
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the policy is to be asked about it."""
+        return self.trial.state is TrialState.WAITING
 
 
 class Engine:
@@ -81,7 +105,9 @@ class Engine:
         self._clock, self._queue_of = clock, queue_of
         self._run, self._replicas, self._wait = run, list(replicas), wait
         self._on_row, self._videos, self._first = on_row, videos, first
-        self._workers = [WorkerState(slot) for slot in slots]
+        self._slots = list(slots)
+        self._active: dict[SimulatorWorker, ActiveTrial] = {}
+        self._last: dict[SimulatorWorker, WorkItem] = {}
         self._asked: dict[Replica, tuple[list[ActiveTrial], float]] = {}
         self._timers = {r: BatchTimer(batch_delay_s) for r in self._replicas}
         self._failures: dict[str, int] = {}
@@ -130,8 +156,8 @@ class Engine:
         return self._finished
 
     def _active_trials(self) -> list[ActiveTrial]:
-        """The trials under way, in the order of their workers."""
-        return [s.active for s in self._workers if s.active is not None]
+        """The trials under way, in the order of their slots."""
+        return [self._active[s] for s in self._slots if s in self._active]
 
     def _trials_of(self, replica: Replica) -> list[ActiveTrial]:
         return [s for s in self._active_trials() if s.replica is replica]
@@ -139,29 +165,29 @@ class Engine:
     # --- events
 
     def _fill(self) -> None:
-        """Gives the next units to the workers without one."""
-        for worker in self._workers:
-            if worker.active is not None or worker.slot.starting:
+        """Gives the next units to the slots without one."""
+        for slot in self._slots:
+            if slot in self._active or slot.starting:
                 continue
             replica = self._least_busy()
             if replica is None:
                 return
-            unit = self._queue.take(worker.last, [s.unit.task for s in self._active_trials()])
+            unit = self._queue.take(self._last.get(slot), [s.unit.task for s in self._active_trials()])
             if unit is None:
                 return
-            self._start(worker, unit, replica)
+            self._start(slot, unit, replica)
 
     def _least_busy(self) -> Replica | None:
         users = [s.replica for s in self._active_trials()]
         able = (r for r in self._replicas if not (r.starting or r.gone))
         return min(able, key=users.count, default=None)
 
-    def _start(self, worker: WorkerState, unit: WorkItem[TrialStart], replica: Replica) -> None:
+    def _start(self, slot: SimulatorWorker, unit: WorkItem[TrialStart], replica: Replica) -> None:
         trial = self._run.trial(unit.scenario, unit.trial)
-        worker.last = unit
-        worker.active = ActiveTrial(worker, unit, trial, replica, trial.open_history(replica.host))
+        self._last[slot] = unit
+        self._active[slot] = ActiveTrial(slot, unit, trial, replica, trial.open_history(replica.host))
         record_video = self._videos is not None and self._videos.wants(unit)
-        worker.slot.send("reset", trial.begin(record_video))
+        slot.send("reset", trial.begin(record_video))
 
     def _ask(self, replica: Replica) -> bool:
         """Sends a free replica the trials that wait for it, unless others are about to join the batch."""
@@ -186,17 +212,19 @@ class Engine:
         waiting = [s.waiting_since for s in mine if s.waiting]
         if not waiting:
             return None
-        acting = [s.answered_at for s in mine if s.working and s.answered_at is not None]
-        handing_off = sum(s.working and s.answered_at is None for s in mine)
+        acting = [s.answered_at for s in mine if s.trial.in_simulator and s.answered_at is not None]
+        handing_off = sum(s.trial.in_simulator and s.answered_at is None for s in mine)
         return self._timers[replica].ask_at(waiting, acting, handing_off, replica.host.max_batch)
 
     def _events(self) -> list[Event]:
         """What can happen next."""
         events: list[Event] = []
         events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
-        events += [(s.worker.slot, lambda s=s: self._replied(s)) for s in self._active_trials() if s.working]
+        events += [
+            (s.slot, lambda s=s: self._replied(s)) for s in self._active_trials() if s.trial.in_simulator
+        ]
         if len(self._queue):
-            parties = [*self._replicas, *(s.slot for s in self._workers)]
+            parties = [*self._replicas, *self._slots]
             events += [(p, p.poll_startup) for p in parties if p.starting]
         return events
 
@@ -248,7 +276,7 @@ class Engine:
                     self._finish(active)
             for active in self._trials_of(replica):
                 active.replica = None
-                if not active.working:  # one that works is given up when its slot has replied
+                if not active.trial.in_simulator:  # one that works is given up when its slot has replied
                     self._lost(active, str(err))
             return
         if answers is None:
@@ -258,7 +286,7 @@ class Engine:
         seconds = self._clock() - began
         self._timers[replica].inferred(len(asked), seconds)
         for active, answer in zip(asked, answers, strict=True):
-            trial, slot = active.trial, active.worker.slot
+            trial, slot = active.trial, active.slot
             if isinstance(answer, PolicyUnavailableError):
                 self._away(active, str(answer))
                 continue
@@ -275,7 +303,7 @@ class Engine:
                 self._finish(active)
 
     def _replied(self, active: ActiveTrial) -> None:
-        reply = active.worker.slot.receive()
+        reply = active.slot.receive()
         active.waiting_since = self._clock()
         if active.replica is None:
             self._lost(active, "the policy's process was lost")
@@ -350,7 +378,7 @@ class Engine:
             active.replica.host.finish(active.history)
         if active.recording is not None:
             active.recording.drop()
-        active.worker.active = None
+        del self._active[active.slot]
 
     def _write_first(self) -> None:
         """Writes the rows that were held back, and holds back no more."""

@@ -50,7 +50,6 @@ from lerobot_roborecover.workers.messages import (
     Reply,
     RollbackReply,
     SlotFailure,
-    StepResult,
 )
 
 FAILURES = {
@@ -257,7 +256,7 @@ class Trial:
                 self._progress[-1:] = [percent(reply.progress)]
             if reply.solved:
                 self._end(Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
-        elif isinstance(reply, StepResult | ActResult):
+        elif isinstance(reply, ActResult):
             self._leave(TrialState.ACTING, to=TrialState.WAITING)
             self._acted(reply)
         else:
@@ -340,26 +339,22 @@ class Trial:
 
     # --- inside
 
-    def _acted(self, reply: StepResult | ActResult) -> None:
-        steps = reply.steps if isinstance(reply, ActResult) else 1
+    def _acted(self, reply: ActResult) -> None:
+        steps = reply.steps
         self._sim_s += reply.seconds
         sent = self._sent[:steps]
         self._executed += [np.array(action) for action in sent]
         if self._mark is not None:
             self._record.acted(self._mark.controller, len(sent))
         self.steps += steps
-        told = reply.progress if isinstance(reply, ActResult) else (reply.progress,)
-        self._progress += [percent(done) for done in told if done is not None]
+        self._progress += map(percent, reply.progress)
         if reply.observation is not None:
             self.observation = reply.observation
-        if isinstance(reply, ActResult):
-            self.attachment = reply.attachment
+        self.attachment = reply.attachment
         if reply.success:
             self._record.solved()
-        horizon = self.scenario.task.horizon
-        out_of_steps = self.steps >= self._record.budget(horizon)
-        if reply.over if isinstance(reply, ActResult) else reply.success or out_of_steps:
-            outcome, self.steps = self._record.verdict(self.steps, horizon)
+        if reply.over:
+            outcome, self.steps = self._record.verdict(self.steps, self.scenario.task.horizon)
             self._end(outcome)
         elif steps < len(self._sent):
             self._end(Outcome.POLICY_ERROR, self._problem(self._sent[steps]))

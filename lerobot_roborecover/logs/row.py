@@ -176,6 +176,15 @@ class TrialRow:
         return trial_key(self.scenario_sha256, self.scenario_id, self.config_hash, self.trial)
 
 
+@dataclass(frozen=True)
+class LoggedTrial:
+    """A finished trial and what was executed in it. Apart from `TrialRow`: a log alone has no actions."""
+
+    row: TrialRow
+    actions: np.ndarray
+    """(steps, A), of the type that the policy gave: replaying them is exact only in that type."""
+
+
 def trial_key(scenario_sha256: str, scenario_id: str, config_hash: str, trial: int) -> tuple:
     """Identity of a trial within a log."""
     return (scenario_sha256, scenario_id, config_hash, trial)

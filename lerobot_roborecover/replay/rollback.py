@@ -23,11 +23,11 @@ class RollbackResult:
     """How a rollback went."""
 
     distance: int
-    """Steps gone back."""
+    """Steps gone back; fewer than asked for where there are not as many."""
     undone: int
-    """Those of them that were taken after the handoff."""
+    """Those of them that were taken after the handoff; the others are of the prefix."""
     method: str
-    """`snapshot` or `replay`."""
+    """`snapshot`, or `replay` from the reset."""
 
 
 class RollbackHistory:

@@ -25,6 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lerobot_roborecover.replay.handoff import Handoff
+from lerobot_roborecover.replay.rollback import RollbackResult
 from lerobot_roborecover.scenario import TrialStart
 
 MEMORY_BYTES = 1 << 26
@@ -119,21 +120,11 @@ class EpisodeStart:
 
 
 @dataclass(frozen=True)
-class StepResult:
-    observation: dict[str, Any]
-    success: bool
-    seconds: float
-    """Wall time of the simulator, observation included."""
-    progress: float | None = None
-    """As in `EpisodeStart`."""
-
-
-@dataclass(frozen=True)
 class ActResult:
-    """Reply to `act`: several actions were executed without observations in between."""
+    """Reply to `act`: several actions were executed without observations in between. To `step`: one was."""
 
     observation: dict[str, Any] | None
-    """After the last action; None once the trial is over, when it is not needed."""
+    """After the last action. None after an `act` once the trial is over, when it is not needed."""
     steps: int
     """Actions executed: all, or those up to success or the horizon."""
     success: bool
@@ -151,16 +142,10 @@ class ActResult:
 
 
 @dataclass(frozen=True)
-class RollbackReply:
-    """Reply to `rollback`: the simulation is some steps back."""
+class RollbackReply(RollbackResult):
+    """Reply to `rollback`: how it went, and what is seen there."""
 
     observation: dict[str, Any]
-    distance: int
-    """Steps gone back; fewer than asked for where there are not as many."""
-    undone: int
-    """Those of them that the policy had taken; the others are of the prefix."""
-    method: str
-    """`snapshot`, or `replay` from the reset."""
     seconds: float
     """Wall time, observation included."""
     solved: bool
@@ -180,7 +165,7 @@ class SlotFailure:
     message: str
 
 
-type Reply = EpisodeStart | StepResult | ActResult | RollbackReply | SlotFailure | np.ndarray | dict | None
+type Reply = EpisodeStart | ActResult | RollbackReply | SlotFailure | np.ndarray | dict | None
 
 
 def make_memory() -> int | None:

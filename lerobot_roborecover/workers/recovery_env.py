@@ -169,9 +169,12 @@ class RecoveryEnv(gym.Env):
         observation = self._simulator.observe()
         seconds = time.perf_counter() - began
         return RollbackReply(
-            observation, result.distance, result.undone, result.method, seconds, solved,
+            **asdict(result),
+            observation=observation,
+            seconds=seconds,
+            solved=solved,
             progress=self.progress(),
-        )  # fmt: skip
+        )
 
     def _running(self) -> RollbackHistory:
         if self.handoff is None or self._history is None:

@@ -33,7 +33,6 @@ from lerobot_roborecover.workers.messages import (
     Server,
     SlotConfig,
     SlotFailure,
-    StepResult,
 )
 from lerobot_roborecover.workers.parent import end_with_parent
 from lerobot_roborecover.workers.recovery_env import RecoveryEnv
@@ -67,10 +66,7 @@ class SlotServer:
             return self._simulator.fingerprint()
         assert self._env is not None, f"command {command!r} before reset"
         if command == "step":
-            began = time.perf_counter()
-            observation, _, success, _, _ = self._env.step(argument)
-            seconds = time.perf_counter() - began
-            return StepResult(observation, success, seconds, self._env.progress())
+            return self._act(argument[None], observe=True)
         if command == "act":
             return self._act(argument)
         if command == "rollback":
@@ -111,9 +107,9 @@ class SlotServer:
             return None
         return self._simulator.render()
 
-    def _act(self, actions: np.ndarray) -> ActResult:
+    def _act(self, actions: np.ndarray, *, observe: bool = False) -> ActResult:
         """Executes (n, A) actions, up to success or the horizon; renders at the end alone, and only if it
-        goes on. A trial that records a video renders every step."""
+        goes on, or with `observe`. A trial that records a video renders every step."""
         assert self._env is not None
         began = time.perf_counter()
         success = over = False
@@ -129,7 +125,7 @@ class SlotServer:
             over = success or self._env.out_of_steps
             if over:
                 break
-        observation = None if over else self._simulator.observe()
+        observation = self._simulator.observe() if observe or not over else None
         seconds = time.perf_counter() - began
         return ActResult(observation, steps, success, over, seconds, tuple(frames), progress=tuple(progress))
 

@@ -58,8 +58,8 @@ def ask(server, command, argument):
 
 def drive(server, folder, planned):
     """A rollout to its end, its record kept as the book does."""
-    ended = ask(server, "roll_out", planned)
-    atomic_write(record_path(folder, planned.record_name), ended.record)
+    ended, record = ask(server, "roll_out", planned)
+    atomic_write(record_path(folder, planned.record_name), record)
     return ended
 
 

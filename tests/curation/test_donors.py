@@ -21,9 +21,9 @@ from lerobot_roborecover.curation.donors import (
     write_donors,
 )
 from lerobot_roborecover.curation.funnel import StageCounts
-from lerobot_roborecover.curation.policy_trials import PolicyTrial, read_trials
+from lerobot_roborecover.curation.policy_trials import read_trials
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, actions_digest, actions_path
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import ScenarioError
@@ -62,10 +62,10 @@ def recovery(scenario, jitter: float = 0.0) -> np.ndarray:
     return np.array(actions, np.float32)
 
 
-def trial(scenario, policy, index, success=True, actions=None, **changes) -> PolicyTrial:
+def trial(scenario, policy, index, success=True, actions=None, **changes) -> LoggedTrial:
     actions = recovery(scenario, jitter=0.01 * index) if actions is None else actions
     values = {"actions_sha256": actions_digest(actions), "steps": len(actions), **changes}
-    return PolicyTrial(row(scenario, policy, index, success, **values), actions)
+    return LoggedTrial(row(scenario, policy, index, success, **values), actions)
 
 
 def begun(what: str, count: int) -> list[StageCounts]:

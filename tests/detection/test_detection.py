@@ -176,7 +176,6 @@ def forks(dataset, policy, tmp_path_factory) -> Path:
     """A log of forks of the training scenarios: at every step the policy would fail, an expert would not; in
     clean rollouts nothing is gained."""
     from lerobot_roborecover.detection.forks.arms import ForkArm
-    from lerobot_roborecover.detection.forks.parents import LoggedTrial
     from lerobot_roborecover.detection.forks.trial import Fork
     from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_path
     from lerobot_roborecover.policies.identity import policy_identity
@@ -190,8 +189,7 @@ def forks(dataset, policy, tmp_path_factory) -> Path:
             helped = played_trial(scenario, start, expert=True)
             for step in (0, 4, 8):
                 for arm, trial in (("continue", alone), ("correction", helped)):
-                    parent = LoggedTrial(scenario, alone.row, alone.actions)
-                    note = Fork(parent, step, ForkArm(arm, "" if arm == "continue" else "c")).note()
+                    note = Fork(scenario, alone, step, ForkArm(arm, "" if arm == "continue" else "c")).note()
                     row = replace(
                         trial.row, policy=policy_identity(str(policy)), config_hash=f"{arm} {start} {step}",
                         options={"fork": note.as_json()},

@@ -10,14 +10,20 @@ import pytest
 
 from lerobot_roborecover.analysis.stats.fork_gain import CONTINUE, MATCHED, fork_gains, note_of
 from lerobot_roborecover.detection.forks.arms import ForkArm, parse_arm
-from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, usable
+from lerobot_roborecover.detection.forks.parents import Choice, usable
 from lerobot_roborecover.detection.forks.trial import ANOTHER, OWN, Fork, ForkTrial, TeacherForcedRunner
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, EvalProtocol, actions_digest, read_actions
+from lerobot_roborecover.logs.row import (
+    ACTIONS_FOLDER,
+    EvalProtocol,
+    LoggedTrial,
+    actions_digest,
+    read_actions,
+)
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.replay.rollback import RollbackHistory
-from lerobot_roborecover.scenario import Outcome, ScenarioError
+from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
 from lerobot_roborecover.workers.recovery_env import RecoveryEnv
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.loop import evaluate
@@ -28,12 +34,12 @@ HORIZON = 14
 BACK = 5
 
 
-def parent(scenario, actions: np.ndarray, **changes) -> LoggedTrial:
+def parent(scenario, actions: np.ndarray, **changes) -> tuple[Scenario, LoggedTrial]:
     values = {
         "scenario_sha256": scenario.sha256(), "actions_sha256": actions_digest(actions), "platform": "fake",
         "steps": len(actions), "horizon": scenario.task.horizon, "handoff_step": len(scenario.prefix),
     }  # fmt: skip
-    return LoggedTrial(scenario, trial_row(scenario.id, 0, False, **values | changes), actions)
+    return scenario, LoggedTrial(trial_row(scenario.id, 0, False, **values | changes), actions)
 
 
 PROTOCOL = EvalProtocol("recovery", 0, "p", 1000, 1)
@@ -65,7 +71,7 @@ def test_a_forks_state_is_the_parents_bit_for_bit():
     for step in (0, 4, 19):
         for back in (0, 3, 9):
             arm = ForkArm("rollback", str(back)) if back else ForkArm("fresh")
-            trial = ForkTrial(Fork(parent(scenario, actions), step, arm), PROTOCOL, action_width=2)
+            trial = ForkTrial(Fork(*parent(scenario, actions), step, arm), PROTOCOL, action_width=2)
             spec = trial.begin()
             env = RecoveryEnv(scenario, spec.start, spec.rewind_steps, played=spec.played, spent=spec.spent)
             env.reset()
@@ -90,7 +96,7 @@ def test_a_forks_state_is_the_parents_bit_for_bit():
 def test_a_policy_that_does_otherwise_is_found():
     scenario = fake_scenario(0, horizon=20)
     actions = np.zeros((20, 2), np.float32)
-    fork = Fork(parent(scenario, actions), 7, ForkArm(CONTINUE))
+    fork = Fork(*parent(scenario, actions), 7, ForkArm(CONTINUE))
 
     def asked(chunk):
         trial = ForkTrial(fork, PROTOCOL, action_width=2)
@@ -145,13 +151,13 @@ def test_a_led_history_gets_its_stream_with_the_first_inference_after_the_fork()
 
 def test_streams_are_matched():
     trial = parent(fake_scenario(0), np.zeros((9, 2), np.float32))
-    streams = {Fork(trial, 4, ForkArm(kind), repeat=0).stream for kind in (CONTINUE, "fresh", "policy")}
+    streams = {Fork(*trial, 4, ForkArm(kind), repeat=0).stream for kind in (CONTINUE, "fresh", "policy")}
     assert len(streams) == 1
-    others = {Fork(trial, step, ForkArm("fresh"), repeat=k).stream for step in (4, 5) for k in range(3)}
+    others = {Fork(*trial, step, ForkArm("fresh"), repeat=k).stream for step in (4, 5) for k in range(3)}
     assert len(others) == 6
     assert streams < others
-    assert Fork(trial, 4, ForkArm(CONTINUE), on=OWN).stream is None
-    assert Fork(trial, 4, ForkArm(CONTINUE), on=ANOTHER).stream not in {None, *others}
+    assert Fork(*trial, 4, ForkArm(CONTINUE), on=OWN).stream is None
+    assert Fork(*trial, 4, ForkArm(CONTINUE), on=ANOTHER).stream not in {None, *others}
 
 
 def test_which_trials_and_which_steps():
@@ -167,7 +173,7 @@ def test_which_trials_and_which_steps():
     assert dropped["is a fork itself"] == 1
     assert [r.trial for _, r in usable([(Path("f"), r) for r in rows], Choice(of="failures"))[0]] == [1]
     assert [r.trial for _, r in usable([(Path("f"), r) for r in rows], Choice(trials=1))[0]] == [0]
-    trial = LoggedTrial(fake_scenario(0), rows[1], np.zeros((60, 2)))
+    trial = LoggedTrial(rows[1], np.zeros((60, 2)))
     assert Choice(every=25).steps(trial) == [0, 25, 50]
     assert Choice(every=30).steps(trial) == [0, 30]  # at 60 it was over
     assert Choice(at=(59, 60, 5, 5)).steps(trial) == [5, 59]
@@ -267,7 +273,7 @@ def test_continuing_reproduces_the_rest_of_the_trial(policies, logs, kind, tmp_p
     from lerobot_roborecover.detection.forks import run
 
     def own(parents, arm, request):
-        return [Fork(p, step, arm, on=OWN) for p in parents for step in request.choice.steps(p)]
+        return [Fork(s, p, step, arm, on=OWN) for s, p in parents for step in request.choice.steps(p)]
 
     monkeypatch.setattr(run, "forks_of", own)
     found = forked(policies, logs, kind, tmp_path)
@@ -382,7 +388,7 @@ def test_a_log_without_the_scenarios_is_refused():
     from lerobot_roborecover.detection.forks.parents import with_actions
 
     scenario = fake_scenario(0)
-    row = parent(scenario, np.zeros((3, 2), np.float32)).row
+    row = parent(scenario, np.zeros((3, 2), np.float32))[1].row
     with pytest.raises(RoboRecoverError, match="no such scenario"):
         with_actions([(Path("f"), row)], {})
     other = replace(scenario, prefix=scenario.prefix[:-1], fingerprint=None)

@@ -19,7 +19,6 @@ from lerobot_roborecover.workers.messages import (
     EpisodeStart,
     RollbackReply,
     SlotFailure,
-    StepResult,
 )
 from tests.support.factories import fake_scenario
 
@@ -75,7 +74,7 @@ def test_a_trial_that_succeeds():
     trial.on_reply(ActResult({"state": 2}, 2, False, False, 0.25))
     assert trial.ask() == {"state": 2}
     trial.on_actions(np.ones((1, 2)), seconds=0.5)
-    trial.on_reply(StepResult({"state": 3}, True, 0.25))
+    trial.on_reply(ActResult({"state": 3}, 1, True, True, 0.25))
     assert trial.over
     assert trial.success
     assert trial.outcome is Outcome.SUCCESS
@@ -86,11 +85,11 @@ def test_a_trial_that_succeeds():
 
 def test_out_of_steps():
     trial = handed_off()
-    for _ in range(HORIZON):
+    for k in range(HORIZON):
         assert not trial.over
         trial.ask()
         trial.on_actions(np.zeros((1, 2)), seconds=0.0)
-        trial.on_reply(StepResult({}, False, 0.0))
+        trial.on_reply(ActResult({}, 1, False, k == HORIZON - 1, 0.0))
     assert (trial.outcome, trial.steps, trial.success) == (Outcome.HORIZON, HORIZON, False)
 
 
@@ -149,16 +148,16 @@ def test_a_policy_that_raises():
 
 def test_going_back():
     trial = acting()
-    trial.on_reply(StepResult({"state": 1}, False, 0.0))
+    trial.on_reply(ActResult({"state": 1}, 1, False, False, 0.0))
     trial.ask()
     assert trial.on_actions(Rollback(4), seconds=0.0) == Rollback(4)
     assert trial.state is TrialState.ROLLING_BACK
-    trial.on_reply(RollbackReply({"state": -3}, 4, 1, "snapshot", 0.5, False))
+    trial.on_reply(RollbackReply(4, 1, "snapshot", {"state": -3}, 0.5, False))
     assert trial.state is TrialState.WAITING
     assert trial.observation == {"state": -3}
     trial.ask()
     trial.on_actions(np.zeros((1, 2)), seconds=0.0)
-    trial.on_reply(StepResult({}, True, 0.0))
+    trial.on_reply(ActResult({}, 1, True, True, 0.0))
     (told,) = row(trial).interventions
     assert (told["step"], told["distance"], told["undone"], trial.steps) == (1, 4, 1, 2)
 
@@ -175,7 +174,7 @@ def test_a_rollback_reaches_the_worker_as_a_number_of_steps():
 def test_going_back_to_where_the_task_is_solved():
     trial = asked()
     trial.on_actions(Rollback(4), seconds=0.0)
-    trial.on_reply(RollbackReply({}, 4, 0, "snapshot", 0.5, True))
+    trial.on_reply(RollbackReply(4, 0, "snapshot", {}, 0.5, True))
     assert (trial.outcome, trial.reason) == (Outcome.SOLVED_BY_PREFIX, SOLVED_THERE)
 
 
@@ -205,10 +204,10 @@ EVENTS = {
     "decide": (lambda t: t.on_actions(np.zeros((1, 2)), seconds=0.0), {TrialState.ASKED}),
     "refused": (lambda t: t.on_policy_error("x", seconds=0.0), {TrialState.ASKED}),
     "start": (lambda t: t.on_reply(EpisodeStart({}, HANDOFF)), {TrialState.HANDING_OFF}),
-    "stepped": (lambda t: t.on_reply(StepResult({}, False, 0.0)), {TrialState.ACTING}),
+    "stepped": (lambda t: t.on_reply(ActResult({}, 1, False, False, 0.0)), {TrialState.ACTING}),
     "acted": (lambda t: t.on_reply(ActResult({}, 1, False, False, 0.0)), {TrialState.ACTING}),
     "went back": (
-        lambda t: t.on_reply(RollbackReply({}, 1, 0, "replay", 0.0, False)),
+        lambda t: t.on_reply(RollbackReply(1, 0, "replay", {}, 0.0, False)),
         {TrialState.ROLLING_BACK},
     ),
     "broke": (
@@ -271,7 +270,7 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
             trial.on_actions(Rollback(what), seconds=0.0)
             back = min(what, simulated - undone)
             undone += back
-            trial.on_reply(RollbackReply({}, what, back, "replay", 0.1, False))
+            trial.on_reply(RollbackReply(what, back, "replay", {}, 0.1, False))
             continue
         codes = {"plain": np.zeros(2), "solves": np.ones(2), "bad": BAD}
         chunk = np.stack([codes[code] for code in what])
@@ -290,7 +289,5 @@ def live(decisions, *, whole_chunks: bool) -> Trial:
                 if solved or simulated >= HORIZON + undone:
                     break
             over = solved or simulated >= HORIZON + undone
-            trial.on_reply(
-                ActResult({}, steps, solved, over, 0.1) if whole_chunks else StepResult({}, solved, 0.1)
-            )
+            trial.on_reply(ActResult({}, steps, solved, over, 0.1))
     return trial

@@ -7,15 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_roborecover.curation.policy_trials import PolicyTrial
-from lerobot_roborecover.logs.row import EvalProtocol, actions_digest, make_row
+from lerobot_roborecover.logs.row import EvalProtocol, LoggedTrial, actions_digest, make_row
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.platforms.simulator import advance
 from lerobot_roborecover.replay.handoff import Handoff
 from lerobot_roborecover.scenario import Outcome, Scenario
 
 
-def played_trial(scenario: Scenario, start: str, *, expert: bool, run_seed: int = 1000) -> PolicyTrial:
+def played_trial(scenario: Scenario, start: str, *, expert: bool, run_seed: int = 1000) -> LoggedTrial:
     """One trial.
 
     Args:
@@ -42,10 +41,10 @@ def played_trial(scenario: Scenario, start: str, *, expert: bool, run_seed: int 
         outcome=Outcome.SUCCESS if simulator.succeeded() else Outcome.HORIZON, reason="", steps=len(taken),
         handoff=handoff, sim_s=0.0, policy_s=0.0, actions_sha256=actions_digest(np.asarray(taken)),
     )  # fmt: skip
-    return PolicyTrial(row, np.asarray(taken))
+    return LoggedTrial(row, np.asarray(taken))
 
 
-def played_trials(scenarios: Sequence[Scenario], start: str) -> list[PolicyTrial]:
+def played_trials(scenarios: Sequence[Scenario], start: str) -> list[LoggedTrial]:
     """One trial of each: the expert drives from the start, and from every second recovery point."""
     return [
         played_trial(s, start, expert=start == "initial" or i % 2 == 0)

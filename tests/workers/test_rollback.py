@@ -265,8 +265,8 @@ def test_success_in_the_extra_steps_counts_under_one_reading_alone(solved_at, ex
 
     record = InterventionRecord()
     record.note(Rollback(15), InterventionMark(), 20)
-    record.rolled_back(RollbackReply({}, 15, 15, "snapshot", 0.0, False))
-    assert record.budget(45) == 60
+    record.rolled_back(RollbackReply(15, 15, "snapshot", {}, 0.0, False))
+    assert record.undone == 15
     record.solved()
     outcome, steps = record.verdict(solved_at, 45)
     assert (outcome, steps) == (Outcome(expected), min(solved_at, 45))

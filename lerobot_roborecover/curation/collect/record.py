@@ -24,7 +24,7 @@ from lerobot_roborecover.platforms.limits import Workspace, limits_of
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.platforms.starts import stream
 from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
-from lerobot_roborecover.scenario import Reset, ScenarioError
+from lerobot_roborecover.scenario import Outcome, Reset, ScenarioError
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,25 @@ class Record:
     def __post_init__(self):
         held = np.flatnonzero(self.steps.solved)
         self.solved_after = int(held[0]) if len(held) else None
+
+
+@dataclass(frozen=True)
+class RolloutOutcome:
+    """How one rollout ended: a line of the journal. Apart from `TrialRow`, since an expert's rollout has no
+    protocol, and from `Record`, which is as large as the rollout."""
+
+    rollout: str
+    outcome: str
+    """A `scenario.Outcome`."""
+    steps: int
+    """Actions after settling."""
+    reason: str = ""
+    """Why, where it is neither success nor horizon."""
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it came to its end, so that there is a record."""
+        return Outcome(self.outcome).valid
 
 
 def record_path(folder: str | os.PathLike[str], rollout_id: str) -> Path:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.curation.collect.record import record_path
-from lerobot_roborecover.curation.collect.server import RolloutResult
+from lerobot_roborecover.curation.collect.record import RolloutOutcome, record_path
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import FAILURES, Trial
@@ -24,24 +23,6 @@ from lerobot_roborecover.workers.slots import SlotPool
 ROLLOUTS_FILE = "rollouts.jsonl"
 RECORDS_FOLDER = "rollouts"
 SCHEMA_VERSION = 1
-
-
-@dataclass(frozen=True)
-class RolloutOutcome:
-    """How one rollout ended."""
-
-    rollout: str
-    outcome: str
-    """A `scenario.Outcome`."""
-    steps: int
-    """Actions after settling."""
-    reason: str = ""
-    """Why, where it is neither success nor horizon."""
-
-    @property
-    def recorded(self) -> bool:
-        """Whether it came to its end, so that there is a record."""
-        return Outcome(self.outcome).valid
 
 
 class RolloutJournal:
@@ -120,12 +101,12 @@ def run_expert(units: Iterable[RolloutSpec], pool: SlotPool, slots: int, on_end:
 
     workers = pool.worker_slots(min(slots, max(len(queue), 1)))
     for unit, reply in map_unordered(workers, "roll_out", take, lambda u: u.scenario):
-        name = unit.scenario.record_name
         if isinstance(reply, SlotFailure):
-            on_end(RolloutOutcome(name, FAILURES[reply.kind].value, 0, reply.message), b"")
+            on_end(
+                RolloutOutcome(unit.scenario.record_name, FAILURES[reply.kind].value, 0, reply.message), b""
+            )
         else:
-            assert isinstance(reply, RolloutResult)
-            on_end(RolloutOutcome(name, reply.outcome.value, reply.steps, reply.reason), reply.record)
+            on_end(*reply)
 
 
 def run_policy(

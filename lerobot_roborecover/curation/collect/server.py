@@ -10,7 +10,12 @@ from typing import cast
 import numpy as np
 
 from lerobot_roborecover.curation.collect.experts import make_controller
-from lerobot_roborecover.curation.collect.record import RecorderSettings, RecordingSimulator, pack_record
+from lerobot_roborecover.curation.collect.record import (
+    RecorderSettings,
+    RecordingSimulator,
+    RolloutOutcome,
+    pack_record,
+)
 from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.platforms import Observation, Simulator
 from lerobot_roborecover.platforms.simulator import advance, iter_steps
@@ -22,18 +27,6 @@ from lerobot_roborecover.workers.worker import SlotServer
 SERVER = f"{__name__}:CollectServer"
 REPLY_EVERY_S = 5.0
 """How long a rollout or a rendering goes on before its slot gives a sign of life."""
-
-
-@dataclass(frozen=True)
-class RolloutResult:
-    """Reply to `roll_out`: how a scripted rollout ended."""
-
-    outcome: Outcome
-    steps: int
-    """Actions after settling."""
-    reason: str = ""
-    record: bytes = b""
-    """Content of the record's file, where it came to its end."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +60,7 @@ class CollectServer(SlotServer):
         super().__init__(config)
         self._settings = RecorderSettings(**config.settings) if config.settings else None
         self._recording: RecordingSimulator | None = None
-        self._under_way: Iterator[RolloutResult | RenderedRollout | None] = iter(())
+        self._under_way: Iterator[tuple[RolloutOutcome, bytes] | RenderedRollout | None] = iter(())
         if self._settings is not None:
             self._recording = RecordingSimulator(self._simulator, self._settings)
             self._simulator = cast(Simulator, self._recording)  # by delegation
@@ -100,14 +93,15 @@ class CollectServer(SlotServer):
             self._recording.plan(scenario)
         return super()._smoke(scenario)
 
-    def _act(self, actions: np.ndarray) -> ActResult:
-        result = super()._act(actions)
+    def _act(self, actions: np.ndarray, *, observe: bool = False) -> ActResult:
+        result = super()._act(actions, observe=observe)
         if self._recording is None or not result.over:
             return result
         return replace(result, attachment=pack_record(self._recording.record()))
 
-    def _roll_out(self, planned: RolloutSpec) -> Iterator[RolloutResult | None]:
-        """A rollout; yields None after each step, and at last how it ended."""
+    def _roll_out(self, planned: RolloutSpec) -> Iterator[tuple[RolloutOutcome, bytes] | None]:
+        """A rollout; yields None after each step, and at last how it ended, and its record's file if it
+        did."""
         assert self._recording is not None
         assert self._settings is not None
         simulator, task, reset = self._recording, planned.task, planned.reset
@@ -115,22 +109,23 @@ class CollectServer(SlotServer):
         simulator.reset(task, reset)
         advance(simulator, planned.prefix)
         if simulator.succeeded():
-            yield RolloutResult(
-                Outcome.SOLVED_BY_PREFIX, 0, "the task's predicate holds before the first action"
-            )
+            reason = "the task's predicate holds before the first action"
+            yield RolloutOutcome(planned.record_name, Outcome.SOLVED_BY_PREFIX.value, 0, reason), b""
             return
         rng = stream(self._settings.seed, "driver", task, reset, planned.trial)
         act = make_controller(self._settings.expert, simulator.inner, task, rng)
         for t in range(task.horizon):
             action = np.asarray(act(t), dtype=np.float64)
             if not np.isfinite(action).all():
-                yield RolloutResult(Outcome.POLICY_ERROR, t, f"the controller gave {action}")
+                reason = f"the controller gave {action}"
+                yield RolloutOutcome(planned.record_name, Outcome.POLICY_ERROR.value, t, reason), b""
                 return
             simulator.step(action)
             if simulator.over:
                 solved = simulator.succeeded()
                 outcome = Outcome.SUCCESS if solved else Outcome.HORIZON
-                yield RolloutResult(outcome, t + 1, record=pack_record(simulator.record()))
+                ended = RolloutOutcome(planned.record_name, outcome.value, t + 1)
+                yield ended, pack_record(simulator.record())
                 return
             yield None
 

@@ -18,13 +18,12 @@ from typing import Any
 from lerobot_roborecover.curation.policy_trials import (
     CURRENT_FILE,
     TRIALS_FILE,
-    PolicyTrial,
     env_config,
     read_trials,
     run_trials,
 )
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_path
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, actions_path
 from lerobot_roborecover.logs.trial_log import TrialLog, check_retry
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_file, atomic_write
@@ -181,7 +180,7 @@ def run_policy(
     replicas: int = 0,
     snapshots: Path | None = None,
     on_row: Callable[[Any, int, int], None] = lambda row, done, total: None,
-) -> list[PolicyTrial]:
+) -> list[LoggedTrial]:
     """Runs the trials missing from the policy's folder, and returns all trials.
 
     Args:

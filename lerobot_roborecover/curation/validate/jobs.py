@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.curation.candidates import CandidateSet
-from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, PolicyTrial, env_config, read_trials
+from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, env_config, read_trials
 from lerobot_roborecover.curation.validate.frames import TAIL
 from lerobot_roborecover.curation.validate.originals import OriginalFrames
 from lerobot_roborecover.curation.validate.replay import DrawnRun, OriginalRollout, ReplayJob
@@ -20,7 +20,7 @@ from lerobot_roborecover.curation.validate.request import ValidationRequest
 from lerobot_roborecover.curation.validate.validation import draw_runs
 from lerobot_roborecover.curation.video_settings import VideoSettings, read_video_settings
 from lerobot_roborecover.datasets.frames import KEPT
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.platforms.versions import installed, required
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError, Start
 
@@ -34,13 +34,13 @@ _RENDER_OPTIONS = (
 """Simulator options that decide pictures alone: all that a dataset may choose here."""
 
 
-def read_screening(folder: Path) -> dict[tuple[str, str], list[tuple[str, PolicyTrial]]]:
+def read_screening(folder: Path) -> dict[tuple[str, str], list[tuple[str, LoggedTrial]]]:
     """Trials from recovery points by scenario id and hash, each with its policy's name, by name and trial.
 
     Raises:
         ScenarioError: there are none.
     """
-    found: dict[tuple[str, str], list[tuple[str, PolicyTrial]]] = {}
+    found: dict[tuple[str, str], list[tuple[str, LoggedTrial]]] = {}
     logs = sorted(folder.glob(f"*/{TRIALS_FILE}"))
     if not logs:
         raise ScenarioError(
@@ -60,7 +60,7 @@ def read_screening(folder: Path) -> dict[tuple[str, str], list[tuple[str, Policy
 def make_jobs(
     request: ValidationRequest,
     scenarios: Sequence[Scenario],
-    trials: Mapping[tuple[str, str], Sequence[tuple[str, PolicyTrial]]],
+    trials: Mapping[tuple[str, str], Sequence[tuple[str, LoggedTrial]]],
     sets: Sequence[CandidateSet],
     originals: OriginalFrames,
 ) -> dict[str, ReplayJob]:
@@ -117,7 +117,7 @@ def simulator_options(platform: str, request: ValidationRequest, originals: Orig
     return dict(env_config(platform, str(request.dataset), [f"--{o}" for o in given]).run_spec().slot.options)
 
 
-def _drawn(name: str, trial: PolicyTrial, options: Mapping[str, Any]) -> DrawnRun:
+def _drawn(name: str, trial: LoggedTrial, options: Mapping[str, Any]) -> DrawnRun:
     row: TrialRow = trial.row
     own = {k: row.options[k] for k in _RUN_OPTIONS if k in row.options and row.options[k] != options.get(k)}
     return DrawnRun(name, row.trial, trial.actions, row.success, row.options.get("control_mode"), own)

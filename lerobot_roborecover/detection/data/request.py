@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_roborecover.curation.continuations import Continuation, from_rollouts, from_trials
-from lerobot_roborecover.curation.policy_trials import PolicyTrial, env_config, read_trials, run_trials
+from lerobot_roborecover.curation.policy_trials import env_config, read_trials, run_trials
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.trajectories import read_trajectories
 from lerobot_roborecover.detection.data.choice import DataOptions, choose
 from lerobot_roborecover.detection.data.data import describe, write_monitor_data
 from lerobot_roborecover.logs.policy_settings import digest_of
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.options import option
@@ -123,7 +123,7 @@ def _continuations(
 ) -> list[Continuation]:
     by_id = {s.id: s for s in scenarios}
     work = request.work or request.out.with_name(f"{request.out.name}.trials")
-    kept: dict[str, dict[str, PolicyTrial]] = {}
+    kept: dict[str, dict[str, LoggedTrial]] = {}
     for folder in request.trials_from:
         for trial in _first_trials(folder, by_id, dropped):
             kept.setdefault(_who(trial.row), {})[trial.row.scenario_id] = trial
@@ -163,7 +163,7 @@ def _asked(policy: str, device: str | None) -> str:
     return f"{facts.policy} {digest_of(facts.policy_settings)}"
 
 
-def _first_trials(folder: Path, scenarios: Mapping[str, Scenario], dropped: Counter) -> list[PolicyTrial]:
+def _first_trials(folder: Path, scenarios: Mapping[str, Scenario], dropped: Counter) -> list[LoggedTrial]:
     """A policy's first trial of each of the scenarios, of those that a folder has.
 
     Raises:

@@ -7,26 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from lerobot_roborecover.analysis.stats.fork_gain import FORK
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
+from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Outcome, Scenario, ScenarioError
 from lerobot_roborecover.utils.options import option
 
 OF = ("all", "failures", "successes")
-
-
-@dataclass(frozen=True)
-class LoggedTrial:
-    """A trial that can be forked."""
-
-    scenario: Scenario
-    row: TrialRow
-    actions: np.ndarray
-    """(steps, A) as executed, in their own type."""
 
 
 def _steps(text: str) -> tuple[int, ...]:
@@ -122,8 +110,8 @@ def _why_not(row: TrialRow, choice: Choice) -> str:
 
 def with_actions(
     rows: Iterable[tuple[Path, TrialRow]], scenarios: Mapping[str, Scenario]
-) -> list[LoggedTrial]:
-    """The trials with their actions.
+) -> list[tuple[Scenario, LoggedTrial]]:
+    """The trials with their actions, and their scenarios.
 
     Raises:
         ScenarioError: a trial's actions were not recorded, which names the option that does; or its
@@ -138,5 +126,5 @@ def with_actions(
                 f"trial {row.trial} of {row.scenario_id}: the set {what}. Name the set that was run with "
                 "--scenarios (and --revision)"
             )
-        found.append(LoggedTrial(scenario, row, read_actions(folder, row)))
+        found.append((scenario, LoggedTrial(row, read_actions(folder, row))))
     return found

@@ -18,16 +18,16 @@ from lerobot_roborecover.analysis.stats.fork_gain import CONTINUE, FORK, MATCHED
 from lerobot_roborecover.analysis.stats.labels import settings_differences
 from lerobot_roborecover.curation.policy_trials import TRIALS_FILE, env_config
 from lerobot_roborecover.detection.forks.arms import ForkArm
-from lerobot_roborecover.detection.forks.parents import Choice, LoggedTrial, rows_of, usable, with_actions
+from lerobot_roborecover.detection.forks.parents import Choice, rows_of, usable, with_actions
 from lerobot_roborecover.detection.forks.trial import ANOTHER, OWN, Fork, ForkRun, TeacherForcedRunner
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.session import EvalSession, create_session
 from lerobot_roborecover.evaluation.work_items import WorkItem, unfinished
-from lerobot_roborecover.logs.row import TrialRow
+from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import PolicyRunner
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.options import internal, json_object, option
 
 if TYPE_CHECKING:
@@ -132,16 +132,18 @@ def run_forks(
     return ForkResult(request.out / TRIALS_FILE, tuple(found), len(parents), dropped)
 
 
-def forks_of(parents: Sequence[LoggedTrial], arm: ForkArm, request: ForkRequest) -> list[Fork]:
+def forks_of(
+    parents: Sequence[tuple[Scenario, LoggedTrial]], arm: ForkArm, request: ForkRequest
+) -> list[Fork]:
     """The forks of an arm; of each trial that continues, one more that checks, in its middle: on its own
     random stream, or of one in ten of a deterministic policy's on another."""
     found = []
-    for number, parent in enumerate(parents):
+    for number, (scenario, parent) in enumerate(parents):
         steps = request.choice.steps(parent)
-        found += [Fork(parent, step, arm, k) for step in steps for k in range(request.repeats)]
+        found += [Fork(scenario, parent, step, arm, k) for step in steps for k in range(request.repeats)]
         if arm.teacher_forced and steps and not (request.deterministic and number % _CHECKED):
             on = ANOTHER if request.deterministic else OWN
-            found.append(Fork(parent, steps[len(steps) // 2], arm, on=on))
+            found.append(Fork(scenario, parent, steps[len(steps) // 2], arm, on=on))
     return found
 
 
@@ -151,7 +153,7 @@ def _run_arm(
     shared: EvalSession,
     arm: ForkArm,
     base: PreTrainedConfig,
-    parents: Sequence[LoggedTrial],
+    parents: Sequence[tuple[Scenario, LoggedTrial]],
     on_fork: Callable[[str, int, int], None],
 ) -> list[TrialRow]:
     config = arm.config(base, request.correction_steps)
@@ -159,13 +161,13 @@ def _run_arm(
     options = {**shared.protocol.options, **(facts.intervention.options() if facts.intervention else {})}
     protocol = replace(
         shared.protocol, policy=facts.policy, execution_horizon=facts.execution_horizon, options=options,
-        policy_settings=facts.policy_settings, run_seed=parents[0].row.run_seed,
+        policy_settings=facts.policy_settings, run_seed=parents[0][1].row.run_seed,
     )  # fmt: skip
     forks = forks_of(parents, arm, request)
     of_run: dict[str, Any] = {f.name: getattr(shared, f.name) for f in fields(EvalSession)}
     of_run |= {"protocol": protocol, "intervention": facts.intervention}
     run = ForkRun(**of_run, forks=forks)
-    units = [WorkItem(fork.parent.scenario, k) for k, fork in enumerate(forks)]
+    units = [WorkItem(fork.scenario, k) for k, fork in enumerate(forks)]
     todo = unfinished(run, units)
     if request.deterministic and arm.teacher_forced:
         rest = [forks[unit.trial] for unit in todo if forks[unit.trial].on == MATCHED]

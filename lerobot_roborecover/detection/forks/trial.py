@@ -19,10 +19,16 @@ import numpy as np
 
 from lerobot_roborecover.analysis.stats.fork_gain import FORK, MATCHED, ForkNote
 from lerobot_roborecover.detection.forks.arms import ForkArm
-from lerobot_roborecover.detection.forks.parents import LoggedTrial
 from lerobot_roborecover.evaluation.session import EvalSession
 from lerobot_roborecover.evaluation.trial import PolicyStateFactory, Trial
-from lerobot_roborecover.logs.row import ACTIONS_FOLDER, EvalProtocol, TrialRow, put_actions, trial_seed
+from lerobot_roborecover.logs.row import (
+    ACTIONS_FOLDER,
+    EvalProtocol,
+    LoggedTrial,
+    TrialRow,
+    put_actions,
+    trial_seed,
+)
 from lerobot_roborecover.policies.runner import (
     Act,
     Decision,
@@ -31,7 +37,7 @@ from lerobot_roborecover.policies.runner import (
     Rollback,
     decision_of,
 )
-from lerobot_roborecover.scenario import Start, TrialStart
+from lerobot_roborecover.scenario import Scenario, Start, TrialStart
 from lerobot_roborecover.workers.messages import EpisodeSpec
 
 SAME_ACTION = 1e-4
@@ -45,6 +51,7 @@ OWN, ANOTHER = "own", "another"
 class Fork:
     """One continuation of a logged trial."""
 
+    scenario: Scenario
     parent: LoggedTrial
     step: int
     """New steps of the parent before it."""
@@ -90,7 +97,7 @@ class ForkTrial(Trial):
     """
 
     def __init__(self, fork: Fork, protocol: EvalProtocol, **options: Any):
-        super().__init__(fork.parent.scenario, fork.parent.row.trial, protocol, **options)
+        super().__init__(fork.scenario, fork.parent.row.trial, protocol, **options)
         self._fork = fork
         if not fork.arm.teacher_forced:
             self.steps = fork.step
