@@ -7,8 +7,8 @@ import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from lerobot_roborecover.cli.export_training import TrainingSetOptions
 from lerobot_roborecover.curation.donors import DonorOptions
-from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.utils.determinism import pin_policy_kernels
 from lerobot_roborecover.utils.options import option
 
@@ -20,25 +20,17 @@ MANIFEST_FILE = "donors.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class DonorDataOptions:
+class DonorDataOptions(TrainingSetOptions):
     """Which trials donate, and what is written."""
 
     logs: tuple[Path, ...] = option(positional=True)
     """Trial logs of the base and of the alternatives."""
-    scenarios: str
-    """Scenario set: folder, Hub id or shipped name."""
-    revision: str | None = None
-    """Commit, tag or branch of that set on the Hub."""
-    split: str = "train"
-    """Take this split of it only."""
     base: str
     """The base policy: its checkpoint, or its name in the logs."""
     donors: tuple[str, ...] = option((), name="donor", metavar="CHECKPOINT", checkpoint=True)
     """An alternative that is in the logs: run its four trials; give it again for each."""
     trials_from: tuple[Path, ...] = option((), metavar="DIR")
     """Trials with their actions, as an earlier run left them in its --work: read instead of run."""
-    out: Path
-    """Folder of the dataset; new or empty."""
     work: Path | None = None
     """Folder of the donors' trials, kept between runs (OUT.trials)."""
     rule: DonorOptions = field(default_factory=DonorOptions)
@@ -46,15 +38,9 @@ class DonorDataOptions:
     """Run seed of the donors' trials."""
     device: str | None = None
     """Device of the donors."""
-    num_workers: int = option(1, old=("workers",))
-    """Processes that replay and render."""
     statistics_of: str | None = option(None, metavar="CHECKPOINT")
     """Normalise as this checkpoint does, whose training goes on here (default: the base, where --base is a
     checkpoint's folder)."""
-    license: str | None = option(None, parse=license_argument)
-    """Licence by the Hub's identifier, of the trajectories; none is assumed."""
-    env: tuple[str, ...] = option((), metavar="NAME=VALUE")
-    """Option of the recovery env type, e.g. obs_type=state; may be given again."""
 
 
 OPTIONS = DonorDataOptions

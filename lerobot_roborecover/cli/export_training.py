@@ -16,11 +16,9 @@ HELP = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingDataOptions:
-    """Which trials become training data."""
+class TrainingSetOptions:
+    """Options of every command that makes a dataset for lerobot-train from trials."""
 
-    sources: tuple[Path, ...] = option(positional=True)
-    """Trial logs of runs with --env.record_actions=true, logs of `detect fork`, folders of donors."""
     scenarios: str
     """Scenario set of the trials: folder, Hub id or shipped name."""
     revision: str | None = None
@@ -29,8 +27,6 @@ class TrainingDataOptions:
     """Take this split of it only."""
     out: Path
     """Folder of the dataset; new or empty."""
-    outcome: Literal["all", "successes", "failures"] = option("all", old=("of",))
-    """Which trials."""
     num_workers: int = option(1, old=("workers",))
     """Processes that replay and render."""
     statistics_of: str | None = option(None, metavar="CHECKPOINT")
@@ -39,6 +35,16 @@ class TrainingDataOptions:
     """Licence by the Hub's identifier; none is assumed."""
     env: tuple[str, ...] = option((), metavar="NAME=VALUE")
     """Option of the recovery env type, e.g. obs_type=state; may be given again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingDataOptions(TrainingSetOptions):
+    """Which trials become training data."""
+
+    sources: tuple[Path, ...] = option(positional=True)
+    """Trial logs of runs with --env.record_actions=true, logs of `detect fork`, folders of donors."""
+    outcome: Literal["all", "successes", "failures"] = option("all", old=("of",))
+    """Which trials."""
 
 
 OPTIONS = TrainingDataOptions

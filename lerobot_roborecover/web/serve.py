@@ -20,26 +20,27 @@ MAX_SOCKET_MESSAGE_BYTES = 2**16
 """Of one websocket message to the server; a larger one ends the connection."""
 
 
-def listen(port: int) -> socket.socket:
-    """A socket on this machine alone.
+def listen(port: int, host: str = HOST) -> socket.socket:
+    """A socket, by default on this machine alone.
 
     Args:
         port: 0 takes a free one.
+        host: address that it is bound to.
 
     Raises:
-        ScenarioError: the port is taken, or none.
+        ScenarioError: the port is taken, or none, or the address is not this machine's.
     """
     # With the protocol named, asyncio turns Nagle's algorithm off: small answers wait for nothing.
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((HOST, port))
+        listener.bind((host, port))
         # A client that connects before the server is ready waits, instead of being refused.
         listener.listen(128)
     except (OSError, OverflowError) as err:
         listener.close()
         raise ScenarioError(
-            f"port {port} cannot be used: {err}. Name another: --port 0 takes a free one"
+            f"{host}:{port} cannot be served: {err}. Name another port, or 0 for a free one"
         ) from None
     return listener
 

@@ -16,7 +16,6 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
-from types import TracebackType
 from typing import Any
 
 from lerobot_roborecover.errors import RoboRecoverError
@@ -148,9 +147,7 @@ class JobPool:
     def __enter__(self) -> JobPool:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.close()
 
     def outcomes[I](

@@ -432,7 +432,7 @@ def test_the_guide_has_the_nine_cells_and_the_dataset_s_own_pictures(quiet):
     [
         ({"annotators": ["../ann"]}, "is not 1 to 32 of a-z"),
         ({"annotators": ["ann", "ann"]}, "named twice"),
-        ({"port": 99999}, "port 99999 cannot be used"),
+        ({"port": 99999}, "99999 cannot be served"),
     ],
 )
 def test_a_session_that_cannot_be_is_refused(dataset, tmp_path, changes, said):

@@ -85,6 +85,7 @@ class DetectorRewardModel(PreTrainedRewardModel):
     """Whether its scores are probabilities."""
     least_threshold: float = -math.inf
     """Below it no threshold is set, whatever the rate of false alarms that is allowed."""
+    weights_file: str = WEIGHTS_FILE
 
     def __init__(self, config: Any, **_: Any):
         if isinstance(config, DetectorConfig):
@@ -153,17 +154,23 @@ class DetectorRewardModel(PreTrainedRewardModel):
         revision: str | None = None,
         **kwargs: Any,
     ) -> Self:
-        """Loads a fitted detector from a folder or the Hub.
+        """Loads a fitted detector from a folder or the Hub, in evaluation mode.
 
         Raises:
-            DetectorError: its weights are missing or do not fit.
+            DetectorError: its weights are missing or do not fit, or it is of another kind.
         """
         if config is None:
             config = RewardModelConfig.from_pretrained(pretrained_name_or_path, revision=revision)
-        model = cls(config)
-        model.restore(lambda: load_file(find_file(pretrained_name_or_path, WEIGHTS_FILE, revision)))
-        model.trained_on = read_trained_on(pretrained_name_or_path, revision)
+        if not isinstance(config, cls.config_class):
+            raise DetectorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
+        model = cls(config, **{k: kwargs.get(k) for k in ("dataset_stats", "dataset_meta")})
+        model.restore(lambda: load_file(find_file(pretrained_name_or_path, cls.weights_file, revision)))
+        model.add_trained_on(read_trained_on(pretrained_name_or_path, revision))
         return model.to(config.device).eval()
+
+    def add_trained_on(self, earlier: dict[str, Any]) -> None:
+        """Takes what the weights that were loaded had been trained on."""
+        self.trained_on = earlier
 
     def restore(self, weights: Any) -> None:
         """Takes what was fitted.

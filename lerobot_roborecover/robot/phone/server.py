@@ -29,7 +29,7 @@ from lerobot_roborecover.robot.console import Console
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.web.guard import Refusal, guarded, read_body
 from lerobot_roborecover.web.page import PageFiles
-from lerobot_roborecover.web.serve import make_server
+from lerobot_roborecover.web.serve import listen, make_server
 
 COOKIE = "roborecover_console"
 MAX_TRIES = 5
@@ -195,7 +195,7 @@ class Phone:
 
     def __init__(self, console: Console, config: PhoneConfig, say: Callable[[str], None] = print):
         _check_pair(config.tls_certificate, config.tls_key)
-        self._listener = _listen(config.host, config.port)
+        self._listener = listen(config.port, config.host)
         port = self._listener.getsockname()[1]
         scheme = "https" if config.tls_certificate else "http"
         names = {config.host, "127.0.0.1", "localhost"}
@@ -246,20 +246,6 @@ def _check_pair(certificate: Path | None, key: Path | None) -> None:
         raise ScenarioError(
             f"--tls_certificate={certificate}, --tls_key={key}: no certificate and its key in PEM ({err})"
         ) from None
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(32)
-    except (OSError, OverflowError) as err:
-        listener.close()
-        raise ScenarioError(
-            f"the console cannot be served at {host}:{port}: {err}. Name another port, or 0 for a free one"
-        ) from None
-    return listener
 
 
 def _own_address() -> str:

@@ -7,15 +7,13 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
-from lerobot.configs.rewards import RewardModelConfig
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_roborecover.policies.detectors.base import Answers
-from lerobot_roborecover.policies.detectors.files import find_file, read_trained_on
 from lerobot_roborecover.policies.detectors.interface import TASK, DetectorError
 from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor import (
@@ -52,6 +50,7 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
 
     config_class = RoboRecoverMonitorConfig
     name = "roborecover_monitor"
+    weights_file = ADAPTER_FILE
     config: RoboRecoverMonitorConfig
 
     def __init__(
@@ -213,41 +212,20 @@ class RoboRecoverMonitorRewardModel(MonitorRewardModel):
         )
         self.model.peft_config["default"].save_pretrained(str(folder))
 
-    @classmethod
-    def from_pretrained(
-        cls,
-        pretrained_name_or_path: str | Path,
-        *,
-        config: RewardModelConfig | None = None,
-        revision: str | None = None,
-        **kwargs: Any,
-    ) -> Self:
-        """Loads the base, then the adapters from a folder or the Hub, in evaluation mode.
-
-        Raises:
-            DetectorError: the adapters are missing, do not fit, or are of another base.
-        """
+    def restore(self, weights: Any) -> None:
         from peft import set_peft_model_state_dict
 
-        if config is None:
-            config = RoboRecoverMonitorConfig.from_pretrained(pretrained_name_or_path, revision=revision)
-        if not isinstance(config, RoboRecoverMonitorConfig):
-            raise DetectorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
-        file = find_file(pretrained_name_or_path, ADAPTER_FILE, revision)
-        model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
         try:
-            result = set_peft_model_state_dict(model.model, load_file(file))
+            result = set_peft_model_state_dict(self.model, weights())
         except RuntimeError as err:
-            raise DetectorError(f"{file} does not fit its config.json: {err}") from None
+            raise DetectorError(f"{ADAPTER_FILE} does not fit its config.json: {err}") from None
         missing = [k for k in result.missing_keys if "lora_" in k]
         if missing or result.unexpected_keys:
             odd = missing[0] if missing else result.unexpected_keys[0]
             raise DetectorError(
-                f"{file} does not fit its config.json: {len(missing)} adapters are missing and "
+                f"{ADAPTER_FILE} does not fit its config.json: {len(missing)} adapters are missing and "
                 f"{len(result.unexpected_keys)} not known, e.g. {odd}"
             )
-        model.add_trained_on(read_trained_on(pretrained_name_or_path, revision))
-        return model.to(config.device).eval()
 
 
 def load_base(config: RoboRecoverMonitorConfig) -> tuple[Any, Any]:

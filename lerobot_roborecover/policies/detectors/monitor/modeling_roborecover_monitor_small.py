@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from lerobot.configs import FeatureType
-from lerobot.configs.rewards import RewardModelConfig
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_roborecover.policies.detectors.base import Answers
-from lerobot_roborecover.policies.detectors.files import WEIGHTS_FILE, find_file, read_trained_on
+from lerobot_roborecover.policies.detectors.files import WEIGHTS_FILE
 from lerobot_roborecover.policies.detectors.interface import TASK, DetectorError
 from lerobot_roborecover.policies.detectors.monitor.base import MonitorRewardModel
 from lerobot_roborecover.policies.detectors.monitor.configuration_roborecover_monitor_small import (
@@ -126,32 +125,11 @@ class RoboRecoverMonitorSmallRewardModel(MonitorRewardModel):
         """Writes `model.safetensors`."""
         save_file({k: v.contiguous() for k, v in self.state_dict().items()}, folder / WEIGHTS_FILE)
 
-    @classmethod
-    def from_pretrained(
-        cls,
-        pretrained_name_or_path: str | Path,
-        *,
-        config: RewardModelConfig | None = None,
-        revision: str | None = None,
-        **kwargs: Any,
-    ) -> Self:
-        """Loads a checkpoint from a folder or the Hub, in evaluation mode.
-
-        Raises:
-            DetectorError: the weights are missing, or are of another network.
-        """
-        if config is None:
-            config = RoboRecoverMonitorSmallConfig.from_pretrained(pretrained_name_or_path, revision=revision)
-        if not isinstance(config, RoboRecoverMonitorSmallConfig):
-            raise DetectorError(f"{pretrained_name_or_path}: a {config.type} is no {cls.name}")
-        file = find_file(pretrained_name_or_path, WEIGHTS_FILE, revision)
-        model = cls(config, kwargs.get("dataset_stats"), kwargs.get("dataset_meta"))
+    def restore(self, weights: Any) -> None:
         try:
-            model.load_state_dict(load_file(file))
+            self.load_state_dict(weights())
         except RuntimeError as err:
-            raise DetectorError(f"{file} does not fit its config.json: {err}") from None
-        model.add_trained_on(read_trained_on(pretrained_name_or_path, revision))
-        return model.to(config.device).eval()
+            raise DetectorError(f"{WEIGHTS_FILE} does not fit its config.json: {err}") from None
 
 
 def _cnn(channels: list[int]) -> nn.Sequential:
