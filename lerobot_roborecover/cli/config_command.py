@@ -1,13 +1,17 @@
-"""Runs a command whose options are a LeRobot configuration; refuses what it can before LeRobot's import."""
+"""The commands whose options are a LeRobot configuration: what can be refused is refused before LeRobot's
+import."""
 
 from __future__ import annotations
 
 import ast
 import importlib
+import os
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.early_checks import (
@@ -21,11 +25,13 @@ from lerobot_roborecover.evaluation.early_checks import (
     policy_types,
     recovery_options,
 )
+from lerobot_roborecover.evaluation.options import ALIASES, JSON
 from lerobot_roborecover.platforms import all_platforms
 from lerobot_roborecover.platforms.env_options import LEROBOT_OPTIONS, NOT_OPTIONS
 from lerobot_roborecover.platforms.registry import env_type_of
 from lerobot_roborecover.utils.config_source import SourceClass, SourceField, nested_class, read_class
 
+_PACKAGE = __name__.partition(".")[0]
 _INDENT, _WIDTH = 6, 100
 _CONFIG_PATH = "YAML file of options, nested as their names are; the command line wins."
 _POLICY_PATH = (
@@ -47,38 +53,114 @@ _UNUSED = ("eval.batch_size", "eval.use_async_envs", "eval.recording")
 """LeRobot's, without effect here: beginnings of names."""
 
 
-def run_config_command(
-    source: ConfigSource,
-    main: str,
-    argv: Sequence[str],
-    about: str,
-    check: Callable[[CommandLine], None] | None = None,
-) -> int:
-    """Prints the help, or refuses what is wrong; else hands the command line to LeRobot's parser.
+@dataclass(frozen=True)
+class ConfigCommand:
+    """A command whose options are a LeRobot configuration."""
 
-    Args:
-        source: which options there are.
-        main: `module:function` that takes the command line.
-        argv: arguments without the command's name.
-        about: what the command does, for its help.
-        check: refuses more of what the command line says.
+    HELP: str
+    """What it does."""
+    source: ConfigSource
+    """Which options there are."""
+    main: str
+    """`module:function` that takes the command line, without the command's name."""
+    check: Callable[[CommandLine], None] | None = None
+    """Refuses more of what the command line says."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Environment variables that are set where the user has not."""
 
-    Returns:
-        Exit status.
+    def pass_through(self, argv: Sequence[str]) -> int:
+        """Prints the help, or refuses what is wrong; else hands the command line to LeRobot's parser.
 
-    Raises:
-        OptionError: naming what is wrong, and what is nearest to it.
-    """
-    words = join_values(argv)
-    if {"-h", "--help"} & set(words):
-        print(help_text(source, about, [word for word in words if word not in ("-h", "--help")]))
-        return 0
-    line = CommandLine(source, words)
-    line.check()
-    if check is not None:
-        check(line)
-    module, _, function = main.partition(":")
-    return getattr(importlib.import_module(module), function)(words)
+        Args:
+            argv: arguments without the command's name.
+
+        Returns:
+            Exit status.
+
+        Raises:
+            OptionError: naming what is wrong, and what is nearest to it.
+        """
+        for name, value in self.environment.items():
+            os.environ.setdefault(name, value)
+        words = join_values(argv)
+        if {"-h", "--help"} & set(words):
+            rest = [word for word in words if word not in ("-h", "--help")]
+            print(help_text(self.source, self.HELP, rest))
+            return 0
+        line = CommandLine(self.source, words)
+        line.check()
+        if self.check is not None:
+            self.check(line)
+        module, _, function = self.main.partition(":")
+        return getattr(importlib.import_module(module), function)(words)
+
+
+def _check_plan(line: CommandLine) -> None:
+    """Refuses a plan, or policies of it, that cannot be used."""
+    from lerobot_roborecover.robot.plan import check_policies, read_plan
+
+    path = Path(line.value("plan") or "plan.yaml")
+    if path.is_file():
+        check_policies(read_plan(path))
+
+
+EVAL = ConfigCommand(
+    "evaluate a policy, every simulator busy; takes lerobot-eval's arguments and --runner.*",
+    ConfigSource(
+        "roborecover eval",
+        (f"{_PACKAGE}.evaluation.runner", "RecoveryEvalConfig"),
+        required=(ENV, POLICY),
+        short=ALIASES,
+    ),
+    f"{_PACKAGE}.evaluation.runner:main",
+    # Read when torch is loaded: threads of a policy on the CPU that spin while they wait for each other take
+    # the cores from the simulators. It changes no number.
+    environment={"OMP_WAIT_POLICY": "PASSIVE"},
+)
+CHECK_POLICY = ConfigCommand(
+    "try a policy for a few steps and look for the usual mistakes; takes lerobot-eval's arguments, --json",
+    ConfigSource(
+        "roborecover check policy",
+        (f"{_PACKAGE}.evaluation.check_policy", "CheckPolicyConfig"),
+        required=(ENV, POLICY),
+        short=JSON,
+    ),
+    f"{_PACKAGE}.evaluation.check_policy:main",
+)
+SERVE = ConfigCommand(
+    "serve a LeRobot policy over openpi's websocket protocol; takes --policy.path, --host and --port",
+    ConfigSource(
+        "roborecover serve",
+        (f"{_PACKAGE}.policies.remote.serve", "ServeConfig"),
+        chosen=(POLICY,),
+        required=(POLICY,),
+    ),
+    f"{_PACKAGE}.policies.remote.serve:main",
+)
+CAPTURE = ConfigCommand(
+    "Run a policy on a robot, always recording, and mark where something goes wrong; takes LeRobot's "
+    "--robot.*, --teleop.* and --policy.*.",
+    ConfigSource(
+        "roborecover robot capture",
+        (f"{_PACKAGE}.robot.commands", "CaptureConfig"),
+        chosen=(POLICY,),
+        required=(POLICY,),
+    ),
+    f"{_PACKAGE}.robot.commands:run_capture",
+)
+RESTORE = ConfigCommand(
+    "Put a robot and its scene back to a recovery point, and measure how far off the start is; takes "
+    "LeRobot's --robot.*.",
+    ConfigSource("roborecover robot restore", (f"{_PACKAGE}.robot.commands", "RestoreConfig"), chosen=()),
+    f"{_PACKAGE}.robot.commands:run_restore",
+)
+RUN_PLAN = ConfigCommand(
+    "Run a plan of recovery points and policies on a robot, blind and in random order; takes LeRobot's "
+    "--robot.* and --teleop.*.",
+    ConfigSource("roborecover robot run", (f"{_PACKAGE}.robot.commands", "PlanRunConfig"), chosen=()),
+    f"{_PACKAGE}.robot.commands:run_plan",
+    _check_plan,
+)
 
 
 def help_text(source: ConfigSource, about: str, words: Sequence[str]) -> str:

@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from types import ModuleType
 from typing import Any, NoReturn
 
 from lerobot_roborecover._version import __version__
@@ -26,9 +25,11 @@ from lerobot_roborecover.cli.tree import (
 )
 
 
-def command_module(name: str) -> ModuleType:
-    """Imports a command's module, by its name in this folder."""
-    return importlib.import_module(f"lerobot_roborecover.cli.{name}")
+def command_module(name: str) -> Any:
+    """Imports a command's module, or the object that stands for it (`Command.module`)."""
+    module, _, inner = name.partition(":")
+    found = importlib.import_module(f"lerobot_roborecover.cli.{module}")
+    return getattr(found, inner) if inner else found
 
 
 def command_parser(call: Call) -> Parser:
@@ -58,7 +59,7 @@ def _add_command(commands: Any, command: Command) -> None:
     _add_arguments(commands.add_parser(command.word, help=command.summary, description=module.HELP), module)
 
 
-def _add_arguments(parser: Parser, module: ModuleType) -> None:
+def _add_arguments(parser: Parser, module: Any) -> None:
     if hasattr(module, "OPTIONS"):
         add_options(parser, module.OPTIONS)
 

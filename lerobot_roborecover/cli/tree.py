@@ -13,8 +13,9 @@ class Command:
     name: str
     """As it is typed after `roborecover`, e.g. `curate split`."""
     module: str
-    """In this folder, with `HELP`, `OPTIONS` (the command's dataclass) and `run(options) -> exit status`.
-    Where another parser reads the arguments: with `HELP` and `pass_through(argv) -> exit status`."""
+    """In this folder, or `module:NAME` of an object in one, with `HELP`, `OPTIONS` (the command's dataclass)
+    and `run(options) -> exit status`. Where another parser reads the arguments: with `HELP` and
+    `pass_through(argv) -> exit status`."""
     summary: str
     """One line for the lists of commands."""
     old: str = ""
@@ -42,11 +43,11 @@ COMMANDS = (
     Command("demo", "demo", "Evaluate the shipped policy on the shipped scenarios."),
     Command("doctor", "doctor", "Check what this machine has and lacks."),
     Command("plan", "plan", "Plan how many scenarios and trials a comparison needs."),
-    Command("eval", "eval", "Evaluate a policy; takes lerobot-eval's options and --runner.*."),
+    Command("eval", "config_command:EVAL", "Evaluate a policy; takes lerobot-eval's options and --runner.*."),
     Command("report", "report", "Turn trial logs into tables, figures and one HTML page."),
     Command("compare", "compare", "Compare two policies from their trial logs."),
     Command("leaderboard", "leaderboard", "Make a leaderboard from trial logs; offer results to the Hub."),
-    Command("serve", "serve", "Serve a LeRobot policy over openpi's websocket protocol."),
+    Command("serve", "config_command:SERVE", "Serve a LeRobot policy over openpi's websocket protocol."),
     Command("reproduce", "reproduce", "Reproduce a published score, then measure recovery."),
     Command("merge", "merge", "Join the trial logs of shards."),
     Command("export-ema", "export_ema", "Write a training run's averaged weights as a checkpoint."),
@@ -74,13 +75,13 @@ COMMANDS = (
     Command("detect evaluate", "detect_evaluate", "Compare detectors on a policy's own trials."),
     Command("detect evaluate-frames", "detect_evaluate_frames", "Measure a monitor on labelled frames."),
     Command("detect fork", "fork", "Continue logged trials in several ways: counterfactuals.", "fork"),
-    Command("robot capture", "robot_capture", "Run a policy, record it, mark where it goes wrong."),
+    Command("robot capture", "config_command:CAPTURE", "Run a policy, record it, mark where it goes wrong."),
     Command("robot points", "robot_points", "Make recovery points of recorded episodes."),
-    Command("robot restore", "robot_restore", "Put robot and scene back; measure how far off."),
-    Command("robot run", "robot_run", "Run a plan of points and policies, blind."),
+    Command("robot restore", "config_command:RESTORE", "Put robot and scene back; measure how far off."),
+    Command("robot run", "config_command:RUN_PLAN", "Run a plan of points and policies, blind."),
     Command("robot rate", "robot_rate", "Rate recorded trials a second time, blind."),
     Command("robot fieldtrial", "robot_fieldtrial", "Let fieldtrial schedule and label the trials."),
-    Command("check policy", "check_policy", "Try a policy for a few steps.", "check-policy"),
+    Command("check policy", "config_command:CHECK_POLICY", "Try a policy for a few steps.", "check-policy"),
     Command("check platform", "check_platform", "Check that states are rebuilt exactly.", "check-platform"),
 )  # fmt: skip
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.config_command import help_text, shown_options
-from lerobot_roborecover.cli.eval import SOURCE
+from lerobot_roborecover.cli.config_command import EVAL, help_text, shown_options
 from lerobot_roborecover.evaluation.early_checks import env_class, join_values, policy_types
 from lerobot_roborecover.platforms.env_options import NOT_OPTIONS
 from lerobot_roborecover.utils.config_source import read_class
@@ -101,7 +100,7 @@ def test_values_may_stand_behind_a_space():
 
 @pytest.mark.parametrize("platform", ["libero", "metaworld", "robotwin", "fake", "lerobot"])
 def test_help_has_a_sentence_for_every_option_of_an_environment(platform):
-    shown = shown_options(SOURCE, [f"--env=roborecover_{platform}"])
+    shown = shown_options(EVAL.source, [f"--env=roborecover_{platform}"])
     found = env_class(platform)
     assert found is not None
     missing = {
@@ -115,8 +114,8 @@ def test_help_has_a_sentence_for_every_option_of_an_environment(platform):
 
 
 def test_help_with_a_policy_shows_its_options():
-    assert "--policy.n_action_steps=N" in help_text(SOURCE, "", [f"--policy.path={POLICY}"])
-    assert "--policy.url=VALUE" in help_text(SOURCE, "", ["--policy.type=roborecover_remote"])
+    assert "--policy.n_action_steps=N" in help_text(EVAL.source, "", [f"--policy.path={POLICY}"])
+    assert "--policy.url=VALUE" in help_text(EVAL.source, "", ["--policy.type=roborecover_remote"])
 
 
 @pytest.mark.lerobot

@@ -183,7 +183,7 @@ def test_a_thread_gives_back_what_its_calls_return_and_raise():
 HUNG_COMMAND = """
     import ctypes, sys, threading
     from concurrent.futures import ThreadPoolExecutor
-    from lerobot_roborecover.cli import eval as command
+    from lerobot_roborecover.cli.config_command import ConfigCommand
     from lerobot_roborecover.cli.main import main
     from lerobot_roborecover.policies import watchdog
 
@@ -195,7 +195,7 @@ HUNG_COMMAND = """
     def hold_pythons_lock():
         ctypes.PyDLL(None).pause()
 
-    def run(argv):
+    def run(self, argv):
         thread = watchdog.PolicyThread()
         try:
             thread.call({hang}, limit_s=1.0)
@@ -204,7 +204,7 @@ HUNG_COMMAND = """
         thread.close()
         return 1
 
-    command.pass_through = run
+    ConfigCommand.pass_through = run
     sys.argv = ["roborecover", "eval"]
     sys.exit(main())
 """
