@@ -27,10 +27,13 @@ from lerobot_roborecover.datasets.fingerprint import fingerprint_scenarios
 from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.release.convert import Conversion, Problem, platforms_of, read_release
 from lerobot_roborecover.datasets.release.export import export_release
-from lerobot_roborecover.datasets.release.initial_state import check_initial_state
+from lerobot_roborecover.datasets.release.initial_state import (
+    check_initial_state,
+    check_robot,
+    initial_state_of,
+)
 from lerobot_roborecover.datasets.release.previous import compare_with_earlier, read_converted, read_earlier
 from lerobot_roborecover.datasets.release.record import Reading
-from lerobot_roborecover.datasets.release.robot import check_robot, initial_state_of
 from lerobot_roborecover.datasets.release.single_records import read_files
 from lerobot_roborecover.datasets.release.sources import Sources, read_sources
 from lerobot_roborecover.datasets.release.tables import PLATFORMS

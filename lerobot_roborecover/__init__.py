@@ -20,8 +20,7 @@ from lerobot_roborecover.workers.registration import register_with_gymnasium  # 
 if TYPE_CHECKING:
     from lerobot_roborecover.analysis.make import report
     from lerobot_roborecover.datasets import load_scenarios
-    from lerobot_roborecover.evaluation.callback import EvaluationCallback, metrics_of
-    from lerobot_roborecover.evaluation.evaluate import evaluate
+    from lerobot_roborecover.evaluation.evaluate import EvaluationCallback, evaluate, metrics_of
     from lerobot_roborecover.logs.row import TrialRow
     from lerobot_roborecover.platforms import Platform
     from lerobot_roborecover.scenario import Rollout, Scenario
@@ -40,14 +39,14 @@ __all__ = [
 ]
 
 _WHERE = {
-    "EvaluationCallback": "evaluation.callback",
+    "EvaluationCallback": "evaluation.evaluate",
     "Platform": "platforms",
     "Rollout": "scenario",
     "Scenario": "scenario",
     "TrialRow": "logs.row",
     "evaluate": "evaluation.evaluate",
     "load_scenarios": "datasets",
-    "metrics_of": "evaluation.callback",
+    "metrics_of": "evaluation.evaluate",
     "report": "analysis.make",
 }
 """Module of each name that is imported when it is asked for."""

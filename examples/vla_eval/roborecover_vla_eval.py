@@ -33,7 +33,7 @@ from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.evaluation.env_configs import env_type
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS, digest_of
+from lerobot_roborecover.logs.fields import UNKNOWN_WEIGHTS, digest_of
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.policies.remote.errors import RemoteError
 from lerobot_roborecover.policies.remote.mapping import load_mapping

@@ -24,8 +24,8 @@ from lerobot_roborecover.analysis.named_path import split_named
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.labels import tell_settings_apart
+from lerobot_roborecover.logs.fields import settings_of_method
 from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
-from lerobot_roborecover.logs.policy_settings import settings_of_method
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.logs.trial_log import ReadLog, TrialLogError, read_log

@@ -25,8 +25,8 @@ from lerobot_roborecover.analysis.stats.arms import (
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.fork_gain import FORK
 from lerobot_roborecover.analysis.stats.labels import settings_differences, tell_settings_apart
+from lerobot_roborecover.logs.fields import UNKNOWN_WEIGHTS
 from lerobot_roborecover.logs.log_file import LOG_SUFFIXES
-from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.sequential_record import SequentialRecord, read_record
 from lerobot_roborecover.logs.trial_log import ReadLog, TrialLogError, read_log

@@ -43,9 +43,9 @@ def run(options: CheckPlatformOptions) -> int:
     """Runs the checks, a line each as they end; 0 when none failed, 1 otherwise."""
     from lerobot_roborecover.errors import OptionError
     from lerobot_roborecover.platforms import platform_named
+    from lerobot_roborecover.platforms.catalog import choose_tasks
     from lerobot_roborecover.platforms.check import TASKS, CheckRequest, check_platform
     from lerobot_roborecover.platforms.findings import check_lines, count_line, report_json
-    from lerobot_roborecover.platforms.names import choose_tasks
 
     if not 2 <= options.steps <= 100_000:
         raise OptionError(f"--steps={options.steps}: 2 to 100000")

@@ -18,7 +18,7 @@ from lerobot_roborecover.evaluation.launch import EngineConfig, run_work_items
 from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
 from lerobot_roborecover.evaluation.work_items import unfinished, units_of
-from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.fields import digest_of
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, put_actions, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named

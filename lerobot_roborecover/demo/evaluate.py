@@ -10,8 +10,7 @@ from pathlib import Path
 
 from lerobot_roborecover.demo import DemoError
 from lerobot_roborecover.demo.settings import DemoSettings
-from lerobot_roborecover.evaluation.arms import failure
-from lerobot_roborecover.evaluation.child import run_program
+from lerobot_roborecover.evaluation.arms import failure, run_program
 from lerobot_roborecover.evaluation.progress import LogTail, ProgressLine, RunProgress
 from lerobot_roborecover.utils.determinism import policy_kernels
 

@@ -15,7 +15,7 @@ from lerobot_roborecover.curation.policy_trials import TRIALS_FILE
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.datasets.trajectories import ScenarioLink
 from lerobot_roborecover.detection.trials import ReplayedTrial, TrialSource, look_at
-from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.fields import digest_of
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.policies.detectors.interface import DetectorError

@@ -1,7 +1,10 @@
 """An arm: one policy from one start, run in a process of its own until its log has every trial.
 
 `demo`, `reproduce` and the studies of `recipes/` run their arms here, so in each of them a rerun goes on
-where it was, an arm that has finished is not run again, and a failure shows the end of the output.
+where it was, an arm that has finished is not run again, and a failure shows the end of the output. Commands
+run as processes of their own (`run_program`): no interpreter carries anything from one to the next. A log
+that a command keeps for itself holds rows of one policy and setting (`claim_log`): others are moved out of
+it.
 """
 
 from __future__ import annotations
@@ -9,18 +12,21 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_roborecover.evaluation.child import run_program, this_module
 from lerobot_roborecover.platforms.versions import row_versions
 from lerobot_roborecover.policies.identity import content_hash, policy_identity
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.text import output_end
+from lerobot_roborecover.workers.parent import ends_with_this, stop_children
 
 DONE_FILE = "done.json"
 """Beside the log of an arm: the run that it was, and whether it has finished."""
@@ -28,6 +34,15 @@ _SHOWN_LINES = 12
 
 IDENTITY_FILE = "identity.json"
 """Beside the log: whose rows it holds."""
+
+DEFAULTS: Mapping[str, str] = {"MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
+"""Unless the caller's environment says otherwise."""
+NESTED = "ROBORECOVER_NESTED"
+"""Variable of a command that another command runs: the outer one says what comes next."""
+_running: set[subprocess.Popen] = set()
+_POLL_S = 0.5
+CANNOT_START = "cannot start "
+"""What `startable` begins a line with that names a run and says why it cannot be begun."""
 
 
 @dataclass(frozen=True)
@@ -173,3 +188,51 @@ def _by_content(policy: Mapping[str, Any]) -> dict[str, Any]:
         else:
             found[name] = value
     return found
+
+
+def this_module(module: str) -> list[str]:
+    """Beginning of a command that runs a module of the project or of LeRobot."""
+    return [sys.executable, "-m", module]
+
+
+def run_program(
+    command: Sequence[str],
+    variables: Mapping[str, str],
+    output: Path | None = None,
+    watch: Callable[[], None] | None = None,
+) -> int:
+    """Runs a command that ends with its parent, in good order if possible.
+
+    Args:
+        command: program and arguments.
+        variables: win over the environment, such as those that decide how a policy rounds.
+        output: file that takes everything that it says, at its end; None leaves it on the terminal.
+        watch: called twice a second while it runs.
+
+    Returns:
+        Its exit status.
+    """
+    with nullcontext(None) if output is None else output.open("ab") as stream:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL, stdout=stream, stderr=None if stream is None else subprocess.STDOUT,
+            env={**DEFAULTS, **os.environ, **variables, NESTED: "1"}, preexec_fn=ends_with_this(),
+        )  # fmt: skip
+        _running.add(process)
+        try:
+            while True:
+                try:
+                    return process.wait(None if watch is None else _POLL_S)
+                except subprocess.TimeoutExpired:
+                    if watch is not None:
+                        watch()
+        except BaseException:
+            stop_children([process])
+            raise
+        finally:
+            _running.discard(process)
+
+
+def stop_running() -> None:
+    """Stops the children that other threads wait for."""
+    stop_children(list(_running))

@@ -22,9 +22,9 @@ from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation import check_names as names
 from lerobot_roborecover.evaluation import check_numbers as numbers
+from lerobot_roborecover.evaluation.check_names import input_remedy
 from lerobot_roborecover.evaluation.check_steps import FirstSteps, hand_off_scenario, take_steps
 from lerobot_roborecover.evaluation.loading import load_host
-from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.evaluation.options import JSON, long_names
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.evaluation.session import EvalSession, create_session

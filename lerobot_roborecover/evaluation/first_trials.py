@@ -6,7 +6,7 @@ import re
 
 from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.evaluation.trial import Trial
-from lerobot_roborecover.logs.policy_settings import CALLABLE
+from lerobot_roborecover.logs.fields import CALLABLE
 from lerobot_roborecover.policies.runner import Replica
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.utils.text import pluralize
@@ -34,7 +34,7 @@ class FirstTrials:
 
     Args:
         trials: of the run.
-        policy_type: of the policy, `policy_settings.CALLABLE` among others.
+        policy_type: of the policy, `logs.fields.CALLABLE` among others.
         remedy: what to do, where it is known.
     """
 

@@ -13,10 +13,10 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.evaluation.check_names import input_remedy
 from lerobot_roborecover.evaluation.early_checks import check_policy_options
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
-from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import only_meaningful_messages, plain_parsing
 from lerobot_roborecover.policies.determinism import fit_threads, make_cross_cpu_deterministic

@@ -11,8 +11,7 @@ from pathlib import Path
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.real_time import DURING_INFERENCE
 from lerobot_roborecover.scenario import Start
-from lerobot_roborecover.utils.options import parse_shard
-from lerobot_roborecover.utils.renamed_fields import move_old_fields
+from lerobot_roborecover.utils.options import move_old_fields, parse_shard
 
 __all__ = ["GROUPS", "OptionError", "RecoveryOptions"]
 

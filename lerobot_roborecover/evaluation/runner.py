@@ -17,7 +17,7 @@ from lerobot.utils.utils import init_logging
 from lerobot_roborecover.analysis.summary import format_table, summarise
 from lerobot_roborecover.datasets import ScenarioSet
 from lerobot_roborecover.errors import OptionError, check_seed
-from lerobot_roborecover.evaluation.child import NESTED
+from lerobot_roborecover.evaluation.arms import NESTED
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.eval_info import check_eval_info, eval_info
 from lerobot_roborecover.evaluation.launch import EngineConfig, RunResult, run_work_items
@@ -36,7 +36,7 @@ from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.utils.atomic_io import atomic_write
-from lerobot_roborecover.utils.renamed_fields import move_old_fields
+from lerobot_roborecover.utils.options import move_old_fields
 from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import Backend

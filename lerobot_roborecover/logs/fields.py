@@ -5,8 +5,10 @@ The limits are those of what can be run: names as the scenario format has them, 
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -30,6 +32,15 @@ _MAX_DEPTH = 8
 """Levels of lists and objects in `options` and `interventions`."""
 _SEEDS = (-(2**63), 2**64 - 1)
 REMEDY = "Correct the line, or remove it to run its trial again"
+
+UNKNOWN_WEIGHTS = "server_weights"
+"""The setting that says that nothing is known of a server's weights."""
+OBJECT = "policy"
+"""The setting that holds a policy's identity where the user gave it another name."""
+CALLABLE = "callable"
+"""Policy type of a Python callable."""
+_VOUCHED = (OBJECT, UNKNOWN_WEIGHTS, "server", "device")
+"""Settings that may differ between the runs of one method."""
 
 
 class FieldProblem(ValueError):
@@ -315,3 +326,18 @@ REPEATED = tuple(
     or name in ("stage", "deviation", "source", "start", "outcome", "dataset_revision")
 )
 """Texts that many rows share."""
+
+
+def settings_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings that all runs of one method share."""
+    return {k: v for k, v in settings.items() if k not in _VOUCHED}
+
+
+def digest_of(content: Any) -> str:
+    """Returns a short hash of JSON-able content."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+def short_identity(identity: str) -> str:
+    """Returns the first characters of an identity's hash: `callable@1a2b3c4d5e6f` is `1a2b3c`."""
+    return identity.rpartition("@")[2].removeprefix("run-")[:6]

@@ -21,9 +21,8 @@ from typing import Any, NamedTuple
 from unicodedata import normalize
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
-from lerobot_roborecover.logs.fields import MAX_LINE_BYTES, FieldProblem
+from lerobot_roborecover.logs.fields import MAX_LINE_BYTES, OBJECT, FieldProblem, short_identity
 from lerobot_roborecover.logs.log_file import LogFileError, LogTextError, appendable, open_log
-from lerobot_roborecover.logs.policy_settings import OBJECT, short_identity
 from lerobot_roborecover.logs.row import EvalProtocol, TrialRow, row_of
 from lerobot_roborecover.logs.schema import RowChecker, parse_json
 from lerobot_roborecover.scenario import Outcome

@@ -24,7 +24,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.policy_settings import CALLABLE, OBJECT
+from lerobot_roborecover.logs.fields import CALLABLE, OBJECT
 from lerobot_roborecover.policies.action_checks import type_problem
 from lerobot_roborecover.policies.callable_identity import UnhashableError, callable_hash
 from lerobot_roborecover.policies.metadata import PolicyMetadata

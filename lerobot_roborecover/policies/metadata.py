@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.policy_settings import OBJECT
+from lerobot_roborecover.logs.fields import OBJECT
 from lerobot_roborecover.policies.identity import content_hash, policy_identity, policy_settings, saved_config
 from lerobot_roborecover.policies.interventions.options import MEMBERS, POLICY_TYPE, InterventionFacts
 

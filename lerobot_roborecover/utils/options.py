@@ -15,6 +15,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass
 from enum import Enum
 from functools import cache
@@ -303,3 +304,21 @@ def _class_docs(node: ast.ClassDef) -> dict[str, str]:
         ):
             found[field.target.id] = " ".join(doc.value.value.split("\n\n")[0].split())
     return found
+
+
+def move_old_fields(config: Any, prefix: str, names: Mapping[str, str]) -> None:
+    """Moves values given under old names to the fields of today, and prints the new names.
+
+    Args:
+        config: a dataclass whose old fields are None where they are not given.
+        prefix: of its options on the command line, e.g. `--env.`.
+        names: old field to new field.
+    """
+    for old, new in names.items():
+        value = getattr(config, old)
+        if value is None:
+            continue
+        setattr(config, new, value)
+        setattr(config, old, None)
+        with suppress(OSError):  # standard error may be closed
+            print(f"note: {prefix}{old} is now {prefix}{new}", file=sys.stderr)

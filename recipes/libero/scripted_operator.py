@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_goal
+from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, PLACE_KINDS, libero_goal
 from lerobot_roborecover.platforms.libero.expert import LiberoExpert
-from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.scene import LiberoScene
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator

@@ -16,7 +16,7 @@ import numpy as np
 
 from lerobot_roborecover.datasets import load_scenarios, write_scenarios
 from lerobot_roborecover.platforms import SimulatorError
-from lerobot_roborecover.platforms.robotwin.limits import STEP_LIMITS
+from lerobot_roborecover.platforms.robotwin.platform import STEP_LIMITS
 from lerobot_roborecover.platforms.robotwin.simulator import RobotwinSimulator
 from lerobot_roborecover.replay.handoff import with_fingerprint
 from lerobot_roborecover.replay.recorder import Recorder

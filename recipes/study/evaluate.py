@@ -12,8 +12,14 @@ from typing import Any
 from lerobot_roborecover.analysis.make import Gallery, Report, report
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.evaluation.arms import Arm, identity_of_run
-from lerobot_roborecover.evaluation.child import CANNOT_START, run_program, stop_running, this_module
+from lerobot_roborecover.evaluation.arms import (
+    CANNOT_START,
+    Arm,
+    identity_of_run,
+    run_program,
+    stop_running,
+    this_module,
+)
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.determinism import has_kernels
 from lerobot_roborecover.utils.text import output_end

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lerobot_roborecover.curation.pipeline.config import ChainConfig, read_config
 from lerobot_roborecover.datasets.load import builtin_names, load_scenarios
-from lerobot_roborecover.evaluation.child import run_program, this_module
+from lerobot_roborecover.evaluation.arms import run_program, this_module
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write
 from lerobot_roborecover.utils.determinism import KERNELS

@@ -6,7 +6,7 @@ An arm that cannot start is found before the first trial of any, and not when it
 import sys
 from collections.abc import Sequence
 
-from lerobot_roborecover.evaluation.child import CANNOT_START
+from lerobot_roborecover.evaluation.arms import CANNOT_START
 from lerobot_roborecover.evaluation.loading import load_host
 from lerobot_roborecover.evaluation.runner import RecoveryEvalConfig, host_spec
 from lerobot_roborecover.policies.command_line import run_with_arguments

@@ -21,9 +21,9 @@ from lerobot_roborecover.curation.collect.rollouts import RolloutJournal, Rollou
 from lerobot_roborecover.curation.collect.server import SERVER, CollectServer, VideoJob
 from lerobot_roborecover.curation.collect.starts import make_units
 from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.platforms.catalog import choose_tasks
 from lerobot_roborecover.platforms.fake import PLATFORM as FAKE
 from lerobot_roborecover.platforms.limits import limits_of
-from lerobot_roborecover.platforms.names import choose_tasks
 from lerobot_roborecover.platforms.starts import Starts, parse_numbers, stream
 from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task

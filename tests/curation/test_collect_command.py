@@ -14,7 +14,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.collect.record import read_record
 from lerobot_roborecover.curation.funnel import count_stages, read_decisions
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.libero import goals
+from lerobot_roborecover.platforms.libero import catalog
 from lerobot_roborecover.replay.recorder import PERTURBED, UNREACHABLE
 from lerobot_roborecover.scenario import Reset, Rollout, ScenarioError, Task
 from tests.support.factories import save_policy
@@ -161,7 +161,7 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
     from lerobot_roborecover.curation.collect.server import CollectServer, VideoJob
     from lerobot_roborecover.curation.collect.starts import make_units
     from lerobot_roborecover.platforms import platform_named
-    from lerobot_roborecover.platforms.names import choose_tasks
+    from lerobot_roborecover.platforms.catalog import choose_tasks
     from lerobot_roborecover.platforms.starts import Starts
     from lerobot_roborecover.workers.messages import SlotConfig
     from tests.curation.test_collect import ask, drive
@@ -235,7 +235,7 @@ def test_a_dry_run_lists_the_rollouts(tmp_path, capsys):
 
 @pytest.mark.libero
 def test_tasks_that_a_scripted_controller_cannot_do_are_left_out_by_name(tmp_path, capsys, monkeypatch):
-    monkeypatch.delitem(goals.PREDICATES, "turnon")
+    monkeypatch.delitem(catalog.PREDICATES, "turnon")
     command = ["collect", "--env.type=roborecover_libero", "--expert=scripted", "--init-states=0"]
     command += ["--dry-run", f"--out={tmp_path / 'out'}"]
     assert main([*command, "--task=libero_goal"]) == 0

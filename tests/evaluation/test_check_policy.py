@@ -301,8 +301,8 @@ def picture_inputs(*cameras: str) -> dict:
 )  # fmt: skip
 def test_what_gives_a_camera_that_is_missing(platform, options, cameras, observed, said):
     """An option of the environment where one does; a map only where a camera of another name is spare."""
+    from lerobot_roborecover.evaluation.check_names import input_remedy
     from lerobot_roborecover.evaluation.env_configs import env_type
-    from lerobot_roborecover.evaluation.missing_inputs import input_remedy
 
     found = input_remedy(env_type(platform)(**options), picture_inputs(*cameras), {}, observed)
     assert found.endswith(said) if said else not found

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.evaluation import child
+from lerobot_roborecover.evaluation import arms as child
 from lerobot_roborecover.workers import parent
 from tests.support.processes import PATIENCE_S
 

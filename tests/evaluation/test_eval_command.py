@@ -17,7 +17,7 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.datasets import write_scenarios
-from lerobot_roborecover.evaluation.child import NESTED
+from lerobot_roborecover.evaluation.arms import NESTED
 from lerobot_roborecover.evaluation.progress import ProgressLine
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset, fake_scenario, save_policy

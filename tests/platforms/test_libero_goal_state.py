@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_roborecover.platforms.libero.catalog import GOAL_KINDS, workable_order
 from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE, ENVIRONMENT_STATE_DIM
-from lerobot_roborecover.platforms.libero.goals import GOAL_KINDS, workable_order
 from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.scenario import Task
 

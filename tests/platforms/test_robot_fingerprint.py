@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover import load_scenarios
-from lerobot_roborecover.datasets.release.robot import check_robot
+from lerobot_roborecover.datasets.release.initial_state import check_robot
 from lerobot_roborecover.evaluation.session_checks import check_versions
 from lerobot_roborecover.platforms import SimulatorError, make_simulator
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.platforms import make_simulator
-from lerobot_roborecover.platforms.robotwin.limits import STEP_LIMITS
+from lerobot_roborecover.platforms.robotwin.platform import STEP_LIMITS
 from lerobot_roborecover.replay.handoff import hand_off, with_fingerprint
 from lerobot_roborecover.scenario import Outcome, Reset, Scenario, Task
 from tests.support.robotwin_checkouts import (

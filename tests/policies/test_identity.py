@@ -15,7 +15,7 @@ from safetensors.numpy import save_file
 
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS
+from lerobot_roborecover.logs.fields import UNKNOWN_WEIGHTS
 from lerobot_roborecover.policies.identity import (
     NO_RESULT,
     content_hash,

@@ -10,7 +10,7 @@ from itertools import combinations
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.labels import settings_differences
 from lerobot_roborecover.logs.extent import Missing, missing
-from lerobot_roborecover.logs.policy_settings import settings_of_method
+from lerobot_roborecover.logs.fields import settings_of_method
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.sequential_record import SequentialRecord
 from lerobot_roborecover.scenario import Start

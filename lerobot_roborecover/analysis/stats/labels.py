@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lerobot_roborecover.logs.policy_settings import OBJECT, digest_of, short_identity
+from lerobot_roborecover.logs.fields import OBJECT, digest_of, short_identity
 from lerobot_roborecover.logs.row import TrialRow
 
 _NOT_RECORDED = "settings not recorded"

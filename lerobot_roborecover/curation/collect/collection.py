@@ -29,7 +29,7 @@ from lerobot_roborecover.curation.funnel import StageCounts, attrition_table, co
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.evaluation.session import SimulatorSpec
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.platforms.names import choose_tasks
+from lerobot_roborecover.platforms.catalog import choose_tasks
 from lerobot_roborecover.scenario import ScenarioError, Task
 from lerobot_roborecover.utils.text import next_command, pluralize
 

@@ -1,5 +1,6 @@
 """Compares a simulator's first state with the one that a record of the release says it had, and LIBERO's
-fixtures, of which a record says nothing, with where its seed puts them."""
+fixtures, of which a record says nothing, with where its seed puts them. On RoboTwin the robot is compared,
+too: with all joints at 0, the robot alone decides `endpose`."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from lerobot_roborecover.datasets.release.fixtures import angle_rad, check_fixtures
 from lerobot_roborecover.datasets.release.json_form import KEY
-from lerobot_roborecover.datasets.release.robot import check_robot
+from lerobot_roborecover.platforms.robotwin.robot import SIDES, RobotwinRobot, another_robot
 from lerobot_roborecover.platforms.simulator import Simulator
 from lerobot_roborecover.scenario import HANDOFF_TOLERANCE_M, Scenario, ScenarioError
 
@@ -32,6 +33,8 @@ LIMITS: dict[str, dict[str, float]] = {
 """Largest deviations by platform; RoboTwin's gripper openings go from 0 to 1. The release itself allows 5 cm
 and 0.2 rad; with the right versions and reset a record is met to 1e-6, so that this asks for the 2 mm of a
 faithful handoff."""
+
+_ARM_JOINTS = np.arange(14) % 7 != 6
 
 
 def check_initial_state(simulator: Simulator, scenario: Scenario) -> dict[str, float]:
@@ -88,3 +91,34 @@ def _robotwin(simulator: Any, said: Mapping[str, Any]) -> dict[str, float]:
 
 def _distance_mm(found: ArrayLike, said: ArrayLike) -> float:
     return float(np.linalg.norm(np.subtract(found, said))) * 1e3
+
+
+def initial_state_of(scenario: Scenario) -> Mapping[str, Any]:
+    """What the record says of its first state."""
+    return scenario.provenance[KEY]["record"]["initial_state"]
+
+
+def check_robot(robot: RobotwinRobot, said: Mapping[str, Any]) -> dict[str, float] | None:
+    """Compares a robot with the one that recorded, from its files alone.
+
+    Args:
+        robot: the checkout's.
+        said: `initial_state` of a RoboTwin record.
+
+    Returns:
+        Millimetres between the wrists, by side; None where a joint is not at 0, and nothing follows.
+
+    Raises:
+        ScenarioError: it is another one; the message says where its wrists are.
+    """
+    if np.asarray(said["joint_vector"], dtype=np.float64)[_ARM_JOINTS].any():
+        return None
+    found = robot.from_recorded_mm({side: said[f"{side}_endpose"] for side in SIDES})
+    wrong = another_robot(found)
+    if wrong:
+        raise ScenarioError(
+            f"field initial_state: the robot {robot.folder} is another than the record's: {wrong}. Nothing "
+            "recorded there replays on it: put RoboTwin's own embodiment in its place (roborecover doctor "
+            "--platform robotwin says how)"
+        )
+    return found

@@ -17,9 +17,8 @@ from lerobot_roborecover.datasets.release.fields import RequiresOptIn, check_fie
 from lerobot_roborecover.datasets.release.json_form import KEY, form_of, parse_json
 from lerobot_roborecover.datasets.release.sources import Sources
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS, libero_instruction, libero_tasks
-from lerobot_roborecover.platforms.libero.init_states import read_init_states
-from lerobot_roborecover.platforms.libero.settle import leading_no_ops
-from lerobot_roborecover.platforms.robotwin.limits import ACTION_DIMS, STEP_LIMITS
+from lerobot_roborecover.platforms.libero.init_states import leading_no_ops, read_init_states
+from lerobot_roborecover.platforms.robotwin.platform import ACTION_DIMS, STEP_LIMITS
 from lerobot_roborecover.rollout import MAX_ACTION_MAGNITUDE, MAX_PREFIX_STEPS
 from lerobot_roborecover.scenario import Reset, Scenario, ScenarioError, Task
 

@@ -14,7 +14,7 @@ from lerobot_roborecover.datasets.licenses import license_argument
 from lerobot_roborecover.datasets.trajectories import read_trajectories
 from lerobot_roborecover.detection.data.choice import DataOptions, choose
 from lerobot_roborecover.detection.data.data import describe, write_monitor_data
-from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.fields import digest_of
 from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
 from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import Scenario, ScenarioError

@@ -9,9 +9,9 @@ from functools import cache, cached_property
 from typing import Any, ClassVar
 
 from lerobot_roborecover.platforms.base import Platform
+from lerobot_roborecover.platforms.catalog import nearest
 from lerobot_roborecover.platforms.lerobot.known import KNOWN, EnvFacts
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, registered_tasks
-from lerobot_roborecover.platforms.names import nearest
 from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
 from lerobot_roborecover.scenario import ScenarioError, Task
 

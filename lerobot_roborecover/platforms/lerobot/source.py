@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from lerobot_roborecover.platforms.names import nearest
+from lerobot_roborecover.platforms.catalog import nearest
 from lerobot_roborecover.platforms.simulator import SimulatorError
 
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:[\w./-]+\.py)?")

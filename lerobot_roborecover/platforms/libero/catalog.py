@@ -1,9 +1,11 @@
-"""LIBERO's tasks, read from hf-libero's own lists without importing it."""
+"""LIBERO's tasks, read from hf-libero's own lists without importing it, and the predicates of their goals
+with an order in which they can be reached one after the other."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
+from collections.abc import Sequence
 from functools import cache
 
 from lerobot_roborecover.platforms.libero.assets import package_root
@@ -14,6 +16,13 @@ LIBERO_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 
 LIBERO_HORIZONS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520}
 """S, new steps a trial may take (the paper's release; LeRobot's own table says 280 for Spatial)."""
+
+GOAL_KINDS = ("on", "in", "open", "close", "turnon")
+"""Every predicate of the four suites' goals."""
+PLACE_KINDS = ("on", "in")
+"""Those about where an object is."""
+PREDICATES = {"turnon": 0, "open": 0, "on": 1, "in": 1, "close": 2, "turnoff": 2}
+"""Predicates of a goal that the controllers know, and when their turn comes."""
 
 
 @cache
@@ -53,3 +62,17 @@ def libero_goal(suite: str, name: str) -> list[list[str]]:
 def libero_instruction(name: str) -> str:
     """The instruction LIBERO derives from a task's name: underscores to spaces, no scene prefix."""
     return re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")
+
+
+def turn_of(predicate: Sequence[str]) -> int:
+    """When a predicate's turn comes, the lowest first."""
+    return PREDICATES.get(predicate[0], 1)
+
+
+def workable_order(predicates: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+    """LIBERO's order, but what is opened or turned on comes first, and what is closed comes last.
+
+    Args:
+        predicates: each with its arguments, e.g. `("in", "mug_1", "microwave_1_heating_region")`.
+    """
+    return [tuple(p) for p in sorted(predicates, key=turn_of)]

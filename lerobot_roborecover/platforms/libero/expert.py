@@ -16,7 +16,7 @@ from lerobot_roborecover.platforms.libero.articulated import (
     JointMotion,
     KnobTurn,
 )
-from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS, turn_of
+from lerobot_roborecover.platforms.libero.catalog import PLACE_KINDS, turn_of
 from lerobot_roborecover.platforms.libero.insert import PlaceInside, on_sill
 from lerobot_roborecover.platforms.libero.motion import ArmMotion, Flaws
 from lerobot_roborecover.platforms.libero.pick_place import PickPlace

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from lerobot_roborecover.platforms.libero.boxes import BodyBoxes, Box
-from lerobot_roborecover.platforms.libero.goals import GOAL_KINDS, workable_order
+from lerobot_roborecover.platforms.libero.catalog import GOAL_KINDS, workable_order
 
 if TYPE_CHECKING:
     from lerobot_roborecover.platforms.libero.task import LiberoTask

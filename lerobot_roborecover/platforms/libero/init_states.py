@@ -1,4 +1,5 @@
-"""LIBERO's stored init states, read without torch."""
+"""LIBERO's stored init states, read without torch, and its settling no-ops, recognised in recorded
+actions."""
 
 from __future__ import annotations
 
@@ -10,6 +11,9 @@ import numpy as np
 
 from lerobot_roborecover.platforms.libero.assets import package_root
 from lerobot_roborecover.platforms.simulator import SimulatorError
+
+_MOST = 10
+"""No-ops at the start of an episode (LeRobot and the paper's release)."""
 
 
 def read_init_states(suite: str, name: str) -> np.ndarray:
@@ -51,3 +55,13 @@ class _ArrayUnpickler(pickle.Unpickler):
         if (module, name) not in self._ALLOWED:
             raise pickle.UnpicklingError(f"{module}.{name} is not part of a numpy array")
         return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+
+
+def leading_no_ops(actions: np.ndarray) -> int:
+    """How many of the first ten actions are no-ops with an open gripper, before the first that is not.
+
+    Args:
+        actions: (T, 7) float64.
+    """
+    still = (actions[:_MOST] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]).all(axis=1)
+    return int(still.argmin()) if not still.all() else len(still)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from lerobot_roborecover.platforms.libero.goals import PLACE_KINDS
+from lerobot_roborecover.platforms.libero.catalog import PLACE_KINDS
 from lerobot_roborecover.platforms.libero.joints import FixtureJoint
 from lerobot_roborecover.platforms.simulator import GOAL_OF, HANDLE
 from lerobot_roborecover.scenario import Pose

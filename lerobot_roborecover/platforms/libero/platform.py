@@ -77,8 +77,7 @@ class LiberoPlatform(Platform):
 
     def unsupported_reason(self, task: Task) -> str:
         """The scripted controllers know all predicates of the four suites."""
-        from lerobot_roborecover.platforms.libero.catalog import libero_goal
-        from lerobot_roborecover.platforms.libero.goals import PREDICATES
+        from lerobot_roborecover.platforms.libero.catalog import PREDICATES, libero_goal
 
         unknown = [p for p in libero_goal(task.suite, task.name) if p[0] not in PREDICATES]
         if not unknown:

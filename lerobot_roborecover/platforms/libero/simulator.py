@@ -17,12 +17,15 @@ from lerobot_roborecover.platforms.libero.platform import PLATFORM
 from lerobot_roborecover.platforms.libero.task import FirstReset, LiberoTask
 from lerobot_roborecover.platforms.libero.view import LiberoView, ObservableClock
 from lerobot_roborecover.platforms.limits import Workspace
-from lerobot_roborecover.platforms.memory import release_freed_memory
 from lerobot_roborecover.platforms.simulator import Observation, SimulatorError
 from lerobot_roborecover.scenario import Pose, Reset, Task
 
 if TYPE_CHECKING:
     from lerobot_roborecover.platforms.libero.robosuite_types import LiberoEnv
+import ctypes
+import gc
+import sys
+from collections.abc import Callable
 
 CAMERA_NAMES = {"agentview_image": "image", "robot0_eye_in_hand_image": "image2"}
 """LeRobot's names of LIBERO's two cameras (lerobot/envs/libero.py)."""
@@ -318,3 +321,20 @@ def _observation_space(obs_type: str, images: list[str], size: tuple[int, int]) 
     if obs_type == "state":
         spaces["environment_state"] = real(ENVIRONMENT_STATE_DIM)
     return gym.spaces.Dict(spaces)
+
+
+def _find_trim() -> Callable[[int], int] | None:
+    if sys.platform != "linux":
+        return None
+    return getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's; musl has none
+
+
+_TRIM = _find_trim()
+
+
+def release_freed_memory() -> None:
+    """Has the allocator return what it keeps for later: compiling a task takes far more than the task then
+    needs. Does nothing where it cannot be known."""
+    if _TRIM is not None:
+        gc.collect()
+        _TRIM(0)

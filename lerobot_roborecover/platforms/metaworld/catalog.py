@@ -7,7 +7,7 @@ import json
 from functools import cache
 from pathlib import Path
 
-from lerobot_roborecover.platforms.names import nearest
+from lerobot_roborecover.platforms.catalog import nearest
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import ScenarioError
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.platforms.base import Platform
+from lerobot_roborecover.platforms.catalog import nearest
 from lerobot_roborecover.platforms.controls import Controls
 from lerobot_roborecover.platforms.findings import Check
-from lerobot_roborecover.platforms.names import nearest
-from lerobot_roborecover.platforms.robotwin.limits import ACTION_DIMS, STEP_LIMITS
 from lerobot_roborecover.scenario import ScenarioError, Task
 
 ROOT_VARIABLE = "ROBOTWIN_ROOT"
@@ -22,6 +21,28 @@ _TURNED = ("x", "y", "z", "turn 1", "turn 2", "turn 3", "turn 4")
 _LONG_HORIZON = 500
 """S from which Reversion goes back twice as far."""
 _VULKAN_TIMEOUT_S = 120.0
+
+# Step limits: `task_config/_eval_step_limit.yml` of RoboTwin, at the commit that LeRobot 0.6.1 pins:
+# https://github.com/RoboTwin-Platform/RoboTwin
+ACTION_DIMS = {"qpos": 14, "ee": 16}
+"""By action type: two arms of six joints and a gripper; two end-effector poses (7) and a gripper."""
+_TASKS_BY_LIMIT = {
+    400: "adjust_bottle beat_block_hammer click_alarmclock click_bell grab_roller lift_pot move_can_pot "
+    "move_pillbottle_pad move_playingcard_away move_stapler_pad pick_diverse_bottles pick_dual_bottles "
+    "place_a2b_left place_a2b_right place_container_plate place_fan place_mouse_pad place_object_scale "
+    "place_object_stand place_phone_stand press_stapler rotate_qrcode stamp_seal turn_switch",
+    500: "place_bread_skillet place_burger_fries place_empty_cup place_shoe scan_object",
+    600: "dump_bin_bigbin handover_mic place_dual_shoes",
+    700: "open_laptop place_bread_basket place_can_basket place_object_basket put_object_cabinet "
+    "shake_bottle shake_bottle_horizontally",
+    800: "handover_block place_cans_plasticbox stack_blocks_two",
+    900: "hanging_mug stack_bowls_two",
+    1200: "blocks_ranking_rgb blocks_ranking_size stack_blocks_three stack_bowls_three",
+    1500: "open_microwave",
+    1700: "put_bottles_dustbin",
+}
+STEP_LIMITS = {name: limit for limit, names in _TASKS_BY_LIMIT.items() for name in names.split()}
+"""S by task: new steps a trial may take."""
 
 
 class RobotwinPlatform(Platform):

@@ -11,7 +11,7 @@ from lerobot.optim.optimizers import OptimizerConfig
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.policies.interventions.options import MODES, POLICY_TYPE
 from lerobot_roborecover.policies.not_trained import NotTrained
-from lerobot_roborecover.utils.renamed_fields import move_old_fields
+from lerobot_roborecover.utils.options import move_old_fields
 
 
 @dataclass

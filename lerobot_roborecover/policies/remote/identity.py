@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from lerobot_roborecover.logs.policy_settings import UNKNOWN_WEIGHTS, digest_of
+from lerobot_roborecover.logs.fields import UNKNOWN_WEIGHTS, digest_of
 from lerobot_roborecover.policies.remote.mapping import load_mapping
 from lerobot_roborecover.policies.remote.servers import make_server
 

@@ -13,7 +13,7 @@ from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.utils.utils import init_logging
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.policy_settings import digest_of
+from lerobot_roborecover.logs.fields import digest_of
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.policies.command_line import run_with_arguments
 from lerobot_roborecover.policies.determinism import fit_threads
