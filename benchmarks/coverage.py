@@ -33,6 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import coverage_first_states as shared
 import coverage_labels as labels
+import coverage_policies as policies
 import coverage_runs as several
 import coverage_settings as settings
 from coverage_settings import SIZES, Line
@@ -45,12 +46,12 @@ PARTS = {
     "differences": settings.differences,
     "ratios": settings.ratios,
     "steps": settings.steps,
-    "chosen": settings.chosen,
+    "chosen": policies.chosen,
     "monitor": labels.monitors,
     "agreement": labels.annotators,
     "runs": several.runs,
     "looks": several.looks,
-    "ranks": settings.ranks,
+    "ranks": policies.ranks,
     "tests": settings.tests,
     "first_states": shared.first_states,
     "bootstrap": settings.bootstrap,

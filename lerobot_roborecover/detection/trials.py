@@ -70,7 +70,7 @@ class TrialSource:
 
 @dataclass(frozen=True)
 class ReplayedTrial(LoggedTrial):
-    """A trial and what its steps showed: far too large to be kept for trials that nobody watches."""
+    """A trial and what its steps showed: too large to be kept for trials that no detector watches."""
 
     scenario: Scenario
     control_hz: float

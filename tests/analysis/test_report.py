@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import gc
-import io
 import json
 import re
 import subprocess
@@ -22,8 +20,7 @@ from lerobot_roborecover.analysis.pages.gallery import make_cards
 from lerobot_roborecover.analysis.pages.report import headline, write_report
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.stats.estimators import RowsError
-from lerobot_roborecover.analysis.summary import Estimate
-from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_latex, to_markdown
+from lerobot_roborecover.analysis.tables import to_csv, to_latex, to_markdown
 from lerobot_roborecover.cli.main import main
 from tests.support.factories import fake_dataset
 from tests.support.loop import evaluate
@@ -333,19 +330,6 @@ def test_markup_in_a_log_stays_text(tmp_path):
     assert "\\|" in files.markdown.read_text()
     formula = results_of(tmp_path, [trial_row(n, policy="=1+1") for n in range(2)])
     assert "\n'=1+1," in to_csv(table(formula, "overall"))
-
-
-def test_estimates_become_three_csv_columns():
-    t = Table(
-        "t", "T", (Column("Policy"), Column("RSR", "percent"), Column("N", "count")),
-        (("a", Estimate(0.5, 0.25, 0.75), 3), ("b", Estimate(0.5, float("nan"), float("nan")), 1)),
-    )  # fmt: skip
-    rows = list(csv.reader(io.StringIO(to_csv(t))))
-    assert rows[0] == ["Policy", "RSR", "RSR low", "RSR high", "N"]
-    assert rows[1:] == [["a", "0.5", "0.25", "0.75", "3"], ["b", "0.5", "n/a", "n/a", "1"]]
-    assert "| a | 50.0 [25.0, 75.0] | 3 |" in to_markdown(t)
-    with pytest.raises(ValueError, match="a row has 1 cells for 2 columns"):
-        Table("t", "T", (Column("x"), Column("y")), (("a",),))
 
 
 def test_cards_are_sorted_by_disagreement(tmp_path):

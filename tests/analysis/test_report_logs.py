@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from dataclasses import replace
 
@@ -11,6 +13,8 @@ from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import read_study
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.stats.estimators import RowsError
+from lerobot_roborecover.analysis.summary import Estimate
+from lerobot_roborecover.analysis.tables import Column, Table, to_csv, to_markdown
 from lerobot_roborecover.logs.trial_log import TrialLogError
 from tests.support.trial_rows import trial_row, write_log
 
@@ -137,3 +141,16 @@ def test_a_folder_stands_for_its_logs_and_a_name_for_its_one_policy(tmp_path):
     both = log(tmp_path, [trial_row(0), trial_row(0, policy="other")], "both")
     with pytest.raises(RowsError, match="no one NAME fits"):
         read_study([f"mine={both}"])
+
+
+def test_estimates_become_three_csv_columns():
+    t = Table(
+        "t", "T", (Column("Policy"), Column("RSR", "percent"), Column("N", "count")),
+        (("a", Estimate(0.5, 0.25, 0.75), 3), ("b", Estimate(0.5, float("nan"), float("nan")), 1)),
+    )  # fmt: skip
+    rows = list(csv.reader(io.StringIO(to_csv(t))))
+    assert rows[0] == ["Policy", "RSR", "RSR low", "RSR high", "N"]
+    assert rows[1:] == [["a", "0.5", "0.25", "0.75", "3"], ["b", "0.5", "n/a", "n/a", "1"]]
+    assert "| a | 50.0 [25.0, 75.0] | 3 |" in to_markdown(t)
+    with pytest.raises(ValueError, match="a row has 1 cells for 2 columns"):
+        Table("t", "T", (Column("x"), Column("y")), (("a",),))

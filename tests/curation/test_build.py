@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
-import yaml
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.annotation.votes import SCHEMA_VERSION as VOTES_SCHEMA
@@ -27,41 +25,9 @@ from lerobot_roborecover.datasets.video_frames import check_frames
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.journal import Journal
+from tests.support.build_files import FAKE, WHOLE, changed, write
 
 EXAMPLE = Path(__file__).parents[2] / "policies" / "build" / "metaworld.yaml"
-FAKE = {
-    "platform": "fake",
-    "collect": {
-        "biased": {"expert": "expert_biased", "task": ["push-*"], "draw": 4, "frames": 32, "num_workers": 1},
-        "shaken": {
-            "expert": "expert_biased", "task": ["push-left"], "draw": 2, "perturb": True, "frames": 32,
-            "num_workers": 1,
-        },
-    },
-    "screen": {"trials": 2, "keep": [0, 99], "num_workers": 1},
-    "validate": {"runs": 2, "num_workers": 2},
-    "split": {"sizes": {"train": 0.5, "test": 0.5}},
-    "render": {"frames": 64},
-}  # fmt: skip
-
-
-def write(path: Path, content: dict) -> Path:
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
-def changed(content: dict, key: str, value) -> dict:
-    """A copy with one entry, `a.b.c`, set or, with None, taken out."""
-    content = json.loads(json.dumps(content))
-    *path, last = key.split(".")
-    node = content
-    for part in path:
-        node = node.setdefault(part, {})
-    node.pop(last, None) if value is None else node.update({last: value})
-    return content
-
-
-WHOLE = {**FAKE, "out": "x", "screen": {**FAKE["screen"], "policies": [{"path": "p"}]}}
 
 
 @pytest.mark.lerobot

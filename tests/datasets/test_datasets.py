@@ -21,11 +21,13 @@ from hypothesis.extra.numpy import arrays
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.load import builtin_names
 from lerobot_roborecover.datasets.schema import FOLDER, MAX_PROVENANCE_BYTES, SCHEMA_VERSION
+from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.scenario import (
     DeviationType,
     Fingerprint,
     Pose,
     Reset,
+    Rollout,
     Scenario,
     ScenarioError,
     Source,
@@ -262,3 +264,18 @@ def test_importing_and_reading_bring_neither_lerobot_nor_torch_nor_the_hub_clien
     )
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     subprocess.run([sys.executable, "-c", code], check=True, env=env)
+
+
+def test_options_of_a_reset_are_kept_in_a_dataset(tmp_path):
+    (task,) = platform_named("lerobot_pusht").tasks()
+    reset = Reset(seed=1, options={"reset_to_state": [100.0, 100.0, 250.0, 250.0, 0.5]})
+    plain = Rollout(task, Reset(seed=1), np.full((3, 2), 200.0))
+    made = Scenario(
+        "one", task, reset, plain.actions, stage=Stage.MOVE, deviation=DeviationType.WRONG_POSE,
+        source=Source.NATURAL,
+    )  # fmt: skip
+    assert made.sha256() != plain.sha256()
+    write_scenarios(tmp_path / "set", [made], description="of a test")
+    (back,) = read_scenarios(tmp_path / "set")
+    assert back.reset.options == reset.options
+    assert back.sha256() == made.sha256()

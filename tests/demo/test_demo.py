@@ -1,14 +1,13 @@
 """`roborecover demo`: its runs of `lerobot-eval`, resuming, progress, table and page."""
 
 import ast
-import io
 import json
 import pickle
 import re
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -23,13 +22,12 @@ from lerobot_roborecover.demo.evaluate import eval_command
 from lerobot_roborecover.demo.page import write_page
 from lerobot_roborecover.demo.run import run_demo, spread
 from lerobot_roborecover.demo.settings import DemoSettings, claim_folder, hold_folder
-from lerobot_roborecover.evaluation.progress import LogTail, ProgressLine, RunProgress
-from lerobot_roborecover.logs.row import EvalProtocol, make_row
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.utils.determinism import policy_kernels
+from tests.support.demo_rows import rows_of
 from tests.support.exactness import row_as_recorded
-from tests.support.factories import fake_dataset, fake_scenario, save_policy
+from tests.support.factories import fake_scenario, save_policy
 from tests.support.processes import PATIENCE_S
 from tests.support.shipped_policies import CHECKPOINT
 
@@ -78,11 +76,6 @@ for index, scenario in enumerate(load_scenarios(given["env.scenarios"], select=g
 '''
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return fake_dataset(tmp_path_factory.mktemp("fake") / "set", 4, horizon=20)
-
-
 @pytest.fixture
 def settings(tmp_path, dataset):
     stand_in = tmp_path / "stand_in.py"
@@ -99,25 +92,6 @@ def settings(tmp_path, dataset):
         return DemoSettings(out=tmp_path / "out", **given | changes)
 
     return make
-
-
-def rows_of(dataset, outcomes: dict[str, list[str]], start: str = "recovery", **more) -> list[dict]:
-    protocol = EvalProtocol(start=start, rewind_steps=0, policy="act@1", run_seed=1, execution_horizon=1)
-    scenarios = load_scenarios(str(dataset))
-    return [
-        asdict(
-            make_row(
-                scenarios[scenario], protocol, dataset="x", dataset_revision=None, trial=k, batch_size=1,
-                noise="per_trial", outcome=Outcome(outcome),
-                reason="the <worker> died" if outcome == "sim_error" else "",
-                steps=scenarios[scenario].task.horizon if outcome == "horizon" else 9,
-                handoff=None, sim_s=0.0, policy_s=0.0, actions_sha256="",
-            )
-        )
-        | more
-        for scenario, trials in outcomes.items()
-        for k, outcome in enumerate(trials)
-    ]  # fmt: skip
 
 
 def test_command_is_the_one_a_user_would_type(settings, tmp_path):
@@ -258,61 +232,6 @@ def test_bad_input_ends_with_one_line_and_status_2(settings, tmp_path, capsys, d
     assert "no/such" in refused("--scenarios", str(tmp_path / "no/such"))
     assert "matches none" in refused("--scenarios", str(dataset), "--select", "task=none")
     assert not (tmp_path / "o").exists()
-
-
-def test_log_tail_waits_for_the_end_of_a_line(tmp_path):
-    path = tmp_path / "log"
-    tail = LogTail(path)
-    assert tail.read() == []
-    path.write_text('{"a": 1}\n{"a"')
-    assert tail.read() == [{"a": 1}]
-    assert tail.read() == []
-    with path.open("a") as stream:
-        stream.write(": 2}\n")
-    assert tail.read() == [{"a": 2}]
-
-
-def test_progress_counts_what_was_asked_for(dataset):
-    ids = ["fake-push-left-000", "fake-push-right-001"]
-    counts = RunProgress("recovery", ids, 2)
-    outcomes = {ids[0]: ["success", "horizon", "success"], "fake-push-left-002": ["success"]}
-    counts.add(rows_of(dataset, outcomes) + rows_of(dataset, {ids[1]: ["success"]}, start="initial"))
-    assert (counts.done, counts.total, counts.rate) == (2, 4, 0.5)
-    counts.add(rows_of(dataset, {ids[1]: ["success"]}))
-    assert counts.rate == 0.75, "scenarios count the same, however many of their trials are done"
-
-
-def test_progress_line_tells_the_pace_of_trials_alone(dataset):
-    ids = ["fake-push-left-000", "fake-push-right-001"]
-    counts = RunProgress("recovery", ids, 3)
-    now = [0.0]
-    stream = io.StringIO()
-    progress = ProgressLine("recovery", stream, lambda: now[0])
-
-    def shown(at_s: float, **finished: list[str]) -> str:
-        now[0] = at_s
-        counts.add(rows_of(dataset, {ids[int(k[1])]: v for k, v in finished.items()}))
-        progress.show(counts, final=True)
-        return stream.getvalue().splitlines()[-1]
-
-    assert shown(0, s0=["success"]).endswith(
-        "1/6 trials  success 100.0 %  starting LeRobot and the simulators ..."
-    )
-    assert shown(200, s0=["success", "horizon"]) == "recovery    2/6 trials  success 50.0 %", "no pace yet"
-    assert shown(290, s0=["success", "horizon", "horizon"]).endswith("about 4 min 30 s left")
-    assert shown(400, s1=["success"] * 3).endswith("6/6 trials  success 66.7 %  done")
-
-
-def test_progress_in_a_file_repeats_itself_only_now_and_then(dataset):
-    counts = RunProgress("recovery", ["fake-push-left-000"], 3)
-    now = [0.0]
-    stream = io.StringIO()
-    progress = ProgressLine("recovery", stream, lambda: now[0])
-    for second in range(31):
-        now[0] = float(second)
-        counts.add(rows_of(dataset, {"fake-push-left-000": ["success"] * (second // 10)}))
-        progress.show(counts)
-    assert [line.split()[1] for line in stream.getvalue().splitlines()] == ["0/3", "1/3", "3/3"]
 
 
 class Page(HTMLParser):

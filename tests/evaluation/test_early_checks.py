@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -145,3 +146,21 @@ def test_the_source_says_what_the_classes_have():
     found = read_class(CheckPolicyConfig.__module__, CheckPolicyConfig.__name__)
     assert found is not None
     assert set(found.fields) == names(CheckPolicyConfig)
+
+
+@pytest.mark.parametrize(("mine", "wanted"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_threads_of_the_policy_do_not_spin_unless_asked_to(mine, wanted):
+    """Their runtime reads this when torch is loaded, so it has to be there before."""
+    program = (
+        "import os, sys, types\n"
+        "from lerobot_roborecover.cli.main import main\n"
+        "def seen(argv): print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules); return 0\n"
+        "sys.modules['lerobot_roborecover.evaluation.runner'] = types.SimpleNamespace(main=seen)\n"
+        "main(['eval', '--env.type=roborecover_fake', '--policy.type=act'])"
+    )
+    env = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}
+    env |= {} if mine is None else {"OMP_WAIT_POLICY": mine}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=env, check=True
+    )
+    assert done.stdout.split() == [wanted, "False"]

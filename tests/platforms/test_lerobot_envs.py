@@ -16,15 +16,14 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.datasets import load_scenarios, write_scenarios
-from lerobot_roborecover.datasets.read import read_scenarios
+from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.platforms.check import CheckRequest, check_platform
 from lerobot_roborecover.platforms.lerobot.simulator import LeRobotSimulator
 from lerobot_roborecover.platforms.lerobot.source import EnvSource, check_hub
 from lerobot_roborecover.platforms.simulator import SimulatorError
-from lerobot_roborecover.scenario import DeviationType, Reset, Rollout, Scenario, Source, Stage, Task
+from lerobot_roborecover.scenario import Reset, Task
 from tests.support.hub_client import HubClient
 from tests.support.hub_server import HubServer, Repo
 
@@ -384,18 +383,3 @@ def test_an_environment_on_the_hub_at_a_commit(tmp_path):
 def test_an_unknown_env_type_names_those_that_there_are():
     with pytest.raises(RoboRecoverError, match=r"no env type 'nonsense'.*pusht"):
         platform_named("lerobot_nonsense").tasks()
-
-
-def test_options_of_a_reset_are_kept_in_a_dataset(tmp_path):
-    (task,) = platform_named("lerobot_pusht").tasks()
-    reset = Reset(seed=1, options={"reset_to_state": [100.0, 100.0, 250.0, 250.0, 0.5]})
-    plain = Rollout(task, Reset(seed=1), np.full((3, 2), 200.0))
-    made = Scenario(
-        "one", task, reset, plain.actions, stage=Stage.MOVE, deviation=DeviationType.WRONG_POSE,
-        source=Source.NATURAL,
-    )  # fmt: skip
-    assert made.sha256() != plain.sha256()
-    write_scenarios(tmp_path / "set", [made], description="of a test")
-    (back,) = read_scenarios(tmp_path / "set")
-    assert back.reset.options == reset.options
-    assert back.sha256() == made.sha256()

@@ -17,32 +17,13 @@ from lerobot_roborecover.platforms.libero.assets import (
     quiet_import,
 )
 from lerobot_roborecover.platforms.libero.catalog import (
-    LIBERO_HORIZONS,
-    libero_instruction,
     libero_tasks,
 )
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Pose, Reset, Task
-
-STEPS = 40
-
+from tests.support.libero_steps import actions, assert_robot_state_equals, clock_of, task_of
 
 pytestmark = pytest.mark.libero
-
-
-def task_of(suite: str, index: int) -> Task:
-    name = libero_tasks()[suite][index]
-    return Task("libero", suite, name, libero_instruction(name), LIBERO_HORIZONS[suite])
-
-
-def actions(steps: int = STEPS, seed: int = 0) -> np.ndarray:
-    """(steps, 7) pushes into table and objects, beyond the limits that robosuite clips at."""
-    rng = np.random.default_rng(seed)
-    a = rng.uniform(-1.5, 1.5, (steps, 7))
-    a[:, 2] -= 0.6
-    a[::2, 3:6] = 0.0
-    a[:, 6] = np.where(np.arange(steps) % 20 < 10, 1.0, -1.0)
-    return a
 
 
 def replay(sim, task: Task, reset: Reset, steps: np.ndarray) -> str:
@@ -86,24 +67,6 @@ def twin_of(env):
     twin = object.__new__(LiberoTask)
     twin.env = env
     return twin
-
-
-def clock_of(env) -> np.ndarray:
-    """The sampling clock of robosuite's observables."""
-    observable = env._observables["robot0_eef_pos"]
-    return np.array([observable._time_since_last_sample, float(observable._sampled)])
-
-
-def assert_robot_state_equals(ours: dict, theirs: dict) -> None:
-    for group, keys in {
-        "eef": ("pos", "quat", "mat"),
-        "gripper": ("qpos", "qvel"),
-        "joints": ("pos", "vel"),
-    }.items():
-        for key in keys:
-            a, b = ours[group][key], theirs[group][key]
-            assert (a.dtype, a.shape) == (b.dtype, b.shape), f"{group}.{key}"
-            assert np.array_equal(a, b), f"{group}.{key}: {a - b}"
 
 
 @pytest.mark.nightly
@@ -376,35 +339,6 @@ def test_bodies_name_what_can_move(sim):
     assert {"eef", "akita_black_bowl_1_main", "wooden_cabinet_1_cabinet_top"} <= set(bodies)
     assert not any(name.startswith(("robot", "gripper", "mount")) for name in bodies)
     assert set(sim.fixtures()) == {"flat_stove_1_main", "wine_rack_1_main", "wooden_cabinet_1_main"}
-
-
-def test_observable_clock_is_robosuites():
-    quiet_import(find_assets())
-    from robosuite.utils.observables import Observable, sensor
-
-    from lerobot_roborecover.platforms.libero.view import ObservableClock
-
-    calls = []
-
-    @sensor(modality="test")
-    def count(_cache):
-        calls.append(0)
-        return np.zeros(3)
-
-    observable = Observable("count", count, sampling_rate=20)
-    for _ in range(2):
-        observable.update(0.002, {}, force=True)
-    clock = ObservableClock(0.002, 1 / 20)
-    for _ in range(3000):  # control steps
-        samples = 0
-        for _ in range(25):
-            calls.clear()
-            observable.update(0.002, {})
-            ticked = clock.tick()
-            assert ticked == bool(calls)
-            samples += ticked
-        assert samples == 1  # so that one step after a restore makes its observation valid
-    assert clock.state[0] == observable._time_since_last_sample
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,18 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager
 
 import numpy as np
 
+from lerobot_roborecover.platforms import make_simulator
+from lerobot_roborecover.web.serve import listen, make_server
 from lerobot_roborecover.web.teleop.client import Client
+from lerobot_roborecover.web.teleop.hub import Hub
+from lerobot_roborecover.web.teleop.server import TeleopApp, make_app
+from lerobot_roborecover.web.teleop.simulator_thread import SimulatorThread
+from lerobot_roborecover.web.teleop.store import Store
 from tests.support.processes import PATIENCE_S
 
 GOAL = np.array([-0.3, 0.0])
@@ -51,3 +58,28 @@ def push(client: Client, goal=GOAL, limit: int = 400) -> None:
             target = puck + 0.14 * away
         client.act(np.clip((target - hand) * 10, -1, 1))
     raise AssertionError(f"the puck is not at its goal after {limit} steps: {client.state}")
+
+
+TOKEN = "t" * 32
+
+
+@contextmanager
+def cockpit(folder, starts=(), platform="fake"):
+    """Server and simulator in threads of this process; yields the page's address."""
+    store, hub = Store(folder), Hub()
+    simulation = SimulatorThread(lambda: make_simulator(platform), "ann", starts, store, hub)
+    simulation.start()
+    simulation.ready.wait()
+    listener = listen(0)
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    server = make_server(make_app(TeleopApp(TOKEN, frozenset({host}), hub, simulation.pilot)))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        yield f"http://{host}/drive/?token={TOKEN}"
+    finally:
+        server.should_exit = True
+        thread.join()
+        simulation.stop()
+        simulation.join()
+        store.close()

@@ -12,19 +12,24 @@ from contextlib import contextmanager
 import pytest
 
 from lerobot_roborecover.curation.annotation.discussion import Discussion
-from lerobot_roborecover.curation.annotation.votes import Vote, ballot
+from lerobot_roborecover.curation.annotation.votes import Vote
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.utils.journal import read_journal
 from lerobot_roborecover.web.annotate.identity import names_of, queue_order
-from tests.support.browser import browsing
-from tests.support.candidate_files import CAMERAS, SIDE, STEPS, candidate_dataset
+from tests.support.annotation_page import (
+    CALLED,
+    EPISODES,
+    at,
+    close_guide,
+    opened,
+    press,
+    shown,
+    votes,
+)
+from tests.support.candidate_files import CAMERAS, STEPS, candidate_dataset
 from tests.support.processes import PATIENCE_S
 
 pytestmark = pytest.mark.browser
-
-EPISODES = 1000
-CALLED: dict[str, str] = {}
-"""What annotators call an episode, by candidate id; the first episodes of every dataset here are the same."""
 
 
 @pytest.fixture(scope="module")
@@ -32,30 +37,6 @@ def dataset(tmp_path_factory):
     root = candidate_dataset(tmp_path_factory.mktemp("sets") / "rollouts", EPISODES)
     CALLED.update(names_of(read_candidates(root), root).episodes)
     return root
-
-
-@pytest.fixture(scope="module")
-def browse():
-    with browsing() as visit:
-        yield visit
-
-
-@pytest.fixture(scope="module")
-def visit(browse):
-    """Opens an address, and closes the guide that a first visit opens."""
-
-    def opened(url: str) -> tuple:
-        page, said = browse(url)
-        close_guide(page)
-        return page, said
-
-    return opened
-
-
-def close_guide(page) -> None:
-    page.wait_for_selector("#guide[open]")
-    press(page, "g")
-    page.wait_for_selector("#guide:not([open])", state="attached")
 
 
 @contextmanager
@@ -94,43 +75,6 @@ def server(dataset, folder):
     """One server; each test has annotators of its own."""
     with annotating(dataset, folder, "ann", "bob", "cleo", "dan", "eve", "fay") as (_process, addresses):
         yield addresses
-
-
-def votes(folder, name: str) -> dict:
-    found = ballot(read_journal(folder / "votes" / f"{name}.jsonl", 1), 1).votes
-    return {c: (v.verdict, v.step, v.stage, v.deviation, v.reason) for c, v in found.items()}
-
-
-def press(page, *keys: str) -> None:
-    for key in keys:
-        page.keyboard.press(key)
-
-
-def at(page, position: int, name: str) -> str:
-    """Waits for the annotator's nth episode and returns its id."""
-    candidate = queue_order([f"ep-{i:04d}" for i in range(EPISODES)], name, 0)[position]
-    opened(page, candidate)
-    return candidate
-
-
-def opened(page, candidate: str) -> None:
-    """Waits for an episode."""
-    page.wait_for_selector(f'body[data-episode="{CALLED[candidate]}"]')
-    page.wait_for_selector(f'#cameras canvas[data-episode="{CALLED[candidate]}"]')
-
-
-def shown(page, step: int) -> list[int]:
-    """Waits for a frame and reads its number off the pixels, camera by camera."""
-    page.wait_for_selector(f'#cameras figure:last-child canvas[data-step="{step}"]')
-    return page.evaluate(
-        """(side) => [...document.querySelectorAll("#cameras canvas")].map((canvas) => {
-          const width = side / 8;
-          const row = canvas.getContext("2d").getImageData(0, 16, side, 1).data;
-          return Array.from({ length: 8 }, (_, bit) => (row[4 * (bit * width + width / 2)] > 128) << bit)
-            .reduce((a, b) => a + b);
-        })""",
-        SIDE,
-    )
 
 
 def test_two_annotators_at_once_with_the_keyboard_alone(server, visit, folder):
