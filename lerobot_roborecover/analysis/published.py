@@ -24,10 +24,6 @@ TABLES = (
     "stage_type_rates",
 )
 PLATFORMS = ("robotwin", "libero")
-ORACLE = {"robotwin": (0.9563, 0), "libero": (0.9180, 1)}
-"""Retrospective oracle and number of scenarios that no policy solved, as the appendix states them."""
-LIBERO_TRIALS = 5
-"""Trials per LIBERO scenario: its cell rates are multiples of 1 / (5 n), published to 0.1 point."""
 
 
 @dataclass(frozen=True)

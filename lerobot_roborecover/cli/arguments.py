@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -14,6 +15,18 @@ from lerobot_roborecover.errors import RoboRecoverError
 from lerobot_roborecover.policies.checkpoint import check_checkpoint
 from lerobot_roborecover.utils.options import Option, checkpoints_of, make, options_of
 from lerobot_roborecover.utils.text import nearest
+
+
+@dataclass(frozen=True)
+class OwnCommand:
+    """A command with options of its own, where a module holds several (`tree.Command.module`)."""
+
+    HELP: str
+    """What it does."""
+    OPTIONS: type
+    """The dataclass of its options."""
+    run: Callable[[Any], int]
+    """Given the options; returns the exit status."""
 
 
 class _RefusedError(Exception):

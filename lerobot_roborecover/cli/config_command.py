@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import importlib
 import os
-import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -194,18 +193,6 @@ def help_text(source: ConfigSource, about: str, words: Sequence[str]) -> str:
     if source.short:
         parts.append(_section("short names", [f"  --{s}  is --{long}" for s, long in source.short.items()]))
     return "\n\n".join(parts)
-
-
-def shown_options(source: ConfigSource, words: Sequence[str] = ()) -> dict[str, str]:
-    """Returns the sentence of each option in the help, by its name.
-
-    Args:
-        source: which options there are.
-        words: the rest of the command line.
-    """
-    text = help_text(source, "", words)
-    pairs = re.findall(r"^  (--[\w.]+)(?:[= ].*)?\n((?:      .*(?:\n|$))*)", text, re.MULTILINE)
-    return {name: " ".join(doc.split()) for name, doc in pairs}
 
 
 def _section(title: str, lines: Sequence[str]) -> str:

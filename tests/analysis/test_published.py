@@ -13,6 +13,11 @@ from lerobot_roborecover.analysis.stats.ranking import inverted_pairs
 
 POLICIES = [(p.platform, p.policy) for p in published.policies()]
 
+ORACLE = {"robotwin": (0.9563, 0), "libero": (0.9180, 1)}
+"""Retrospective oracle and number of scenarios that no policy solved, as the appendix states them."""
+LIBERO_TRIALS = 5
+"""Trials per LIBERO scenario: its cell rates are multiples of 1 / (5 n), published to 0.1 point."""
+
 
 def cell_counts(platform: str) -> dict[str, int]:
     """Scenarios of each cell of a platform's test set."""
@@ -35,7 +40,7 @@ def cell_rates(platform: str, policy: str) -> dict[str, float]:
     }
     if platform != "libero":
         return rates
-    return {cell: _unrounded(rate, published.LIBERO_TRIALS * counts[cell]) for cell, rate in rates.items()}
+    return {cell: _unrounded(rate, LIBERO_TRIALS * counts[cell]) for cell, rate in rates.items()}
 
 
 def _unrounded(rate: float, trials: int) -> float:
@@ -56,10 +61,7 @@ def overall_from_groups(axis: str, policy: str) -> float:
     """Overall RSR on LIBERO from the published rates by `construction_source` or by `suite`."""
     rows = [row for row in published.table("libero_groups") if (row["axis"], row["policy"]) == (axis, policy)]
     counts = np.array([int(row["n"]) for row in rows])
-    rates = [
-        _unrounded(float(r["rsr"]) / 100, published.LIBERO_TRIALS * n)
-        for r, n in zip(rows, counts, strict=True)
-    ]
+    rates = [_unrounded(float(r["rsr"]) / 100, LIBERO_TRIALS * n) for r, n in zip(rows, counts, strict=True)]
     return float(counts @ np.array(rates) / counts.sum())
 
 
@@ -166,7 +168,7 @@ def test_contrasts_are_differences_of_the_overall_rates():
 @pytest.mark.parametrize(("platform", "gain"), [("robotwin", 36.13), ("libero", 27.40)])
 def test_oracle_gain(platform, gain):
     best = max(p.rsr.value for p in rows_of(platform))
-    assert 100 * (published.ORACLE[platform][0] - best) == pytest.approx(gain, abs=0.006)
+    assert 100 * (ORACLE[platform][0] - best) == pytest.approx(gain, abs=0.006)
 
 
 def test_gains_of_the_observed_best_alternative():

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.config_command import EVAL, help_text, shown_options
+from lerobot_roborecover.cli.config_command import EVAL, help_text
 from lerobot_roborecover.evaluation.early_checks import env_class, join_values, policy_types
 from lerobot_roborecover.platforms.env_options import NOT_OPTIONS
 from lerobot_roborecover.utils.config_source import read_class
@@ -80,6 +81,13 @@ print(json.dumps(found))
 """
 
 
+def shown_options(words: list[str]) -> dict[str, str]:
+    """The sentence of each option in the help, by its name."""
+    text = help_text(EVAL.source, "", words)
+    pairs = re.findall(r"^  (--[\w.]+)(?:[= ].*)?\n((?:      .*(?:\n|$))*)", text, re.MULTILINE)
+    return {name: " ".join(doc.split()) for name, doc in pairs}
+
+
 @pytest.mark.slow
 def test_refusals_are_one_line_and_import_neither_lerobot_nor_torch():
     done = subprocess.run(
@@ -101,7 +109,7 @@ def test_values_may_stand_behind_a_space():
 
 @pytest.mark.parametrize("platform", ["libero", "metaworld", "robotwin", "fake", "lerobot"])
 def test_help_has_a_sentence_for_every_option_of_an_environment(platform):
-    shown = shown_options(EVAL.source, [f"--env=roborecover_{platform}"])
+    shown = shown_options([f"--env=roborecover_{platform}"])
     found = env_class(platform)
     assert found is not None
     missing = {

@@ -71,7 +71,7 @@ def parse(monkeypatch, tmp_path):
     A remote policy's server answers, and says nothing of itself.
     """
     silent = SimpleNamespace(reach=dict, close=lambda: None)
-    monkeypatch.setattr("lerobot_roborecover.policies.remote.identity.make_server", lambda *_: silent)
+    monkeypatch.setattr("lerobot_roborecover.policies.remote.servers.make_server", lambda *_: silent)
 
     def run(file: Path, *args: str):
         from lerobot.configs import parser

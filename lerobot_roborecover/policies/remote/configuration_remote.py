@@ -63,7 +63,7 @@ class RemoteConfig(NotTrained, PreTrainedConfig):
         Raises:
             RemoteError: the mapping cannot be used, or no server answers.
         """
-        from lerobot_roborecover.policies.remote.identity import remote_settings
+        from lerobot_roborecover.policies.remote.servers import remote_settings
 
         return remote_settings(self)
 
