@@ -15,7 +15,8 @@ from lerobot_roborecover.scenario import Outcome, Scenario
 
 @dataclass(frozen=True)
 class Continuation:
-    """Actions from a scenario's recovery point on, and how they ended."""
+    """Actions from a scenario's recovery point on, and how they ended. Apart from `LoggedTrial`: those of a
+    trajectory dataset have no row."""
 
     scenario: Scenario
     driver: str

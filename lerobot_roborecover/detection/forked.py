@@ -24,7 +24,7 @@ from lerobot_roborecover.scenario import ScenarioError
 
 @dataclass(frozen=True)
 class ForkedTrial:
-    """One trial, continued from several of its steps."""
+    """One trial, continued from several of its steps. Apart from `TrialRow`: each gain is of several rows."""
 
     row: TrialRow
     """Row of its last continuation, which up to the last fork is the trial itself."""

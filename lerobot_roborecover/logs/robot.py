@@ -80,7 +80,7 @@ class StartError:
 
 @dataclass(frozen=True)
 class RobotTrial:
-    """The field `robot` of a trial row."""
+    """The field `robot` of a trial row: what a simulated trial does not have."""
 
     robot_type: str
     calibration_sha256: str

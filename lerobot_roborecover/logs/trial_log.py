@@ -154,7 +154,7 @@ def check_retry(outcomes: Iterable[str]) -> frozenset[str]:
 
 
 class Finished(NamedTuple):
-    """How a trial of the log ended; all that a run remembers of its rows."""
+    """How a trial of the log ended. Apart from `TrialRow`: a run remembers no more of thousands of rows."""
 
     success: bool
     steps: int

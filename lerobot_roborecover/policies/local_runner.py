@@ -47,7 +47,7 @@ by observation."""
 
 @dataclass
 class PolicyState:
-    """State that the policy side keeps for one trial."""
+    """State that the policy side keeps for one trial. Apart from `Trial`: it may be in another process."""
 
     stream: list[torch.Tensor] | None
     """States of torch's generators, the CPU's and the GPU's, for the trial's next draw; None where the run

@@ -31,7 +31,8 @@ class RollbackResult:
 
 
 class RollbackHistory:
-    """A trial's steps since its handoff.
+    """A trial's steps since its handoff. Apart from `Trial`: it lives in the simulator's process, with its
+    snapshots.
 
     Args:
         simulator: at the handoff.

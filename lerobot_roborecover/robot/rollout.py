@@ -26,6 +26,8 @@ FROZEN_AFTER_S = 1.0
 
 @dataclass
 class RolloutEnd:
+    """How a rollout on a robot ended. Apart from `TrialRow`: the verdict is a person's, and comes later."""
+
     steps: int = 0
     """Actions that were sent, a person's included."""
     duration_s: float = 0.0

@@ -30,7 +30,7 @@ _MINUTE_S = 60.0
 
 @dataclass(frozen=True)
 class ScoredTrial:
-    """One trial, and what a detector said at each step."""
+    """One trial, and what a detector said at each step. Apart from `TrialRow`, which no detector has seen."""
 
     scenario: str
     unit: str

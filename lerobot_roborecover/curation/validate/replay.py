@@ -24,7 +24,7 @@ from lerobot_roborecover.scenario import Pose, Scenario, ScenarioError
 
 @dataclass(frozen=True)
 class DrawnRun:
-    """A screening run to replay."""
+    """A screening run to replay. Apart from `LoggedTrial`: it travels to a process that needs no row."""
 
     policy: str
     """Its name in the trials' folder."""

@@ -36,7 +36,8 @@ type Observation = Mapping[str, torch.Tensor]
 
 @dataclass(eq=False)
 class InterventionState:
-    """State of one trial in the composite policy."""
+    """State of one trial in the composite policy. Apart from `PolicyState`, which every member has of its
+    own."""
 
     seed: int | None
     pending: bool
