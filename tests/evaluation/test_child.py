@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.evaluation import arms as child
+from lerobot_roborecover.evaluation import arms
 from lerobot_roborecover.workers import parent
 from tests.support.processes import PATIENCE_S
 
@@ -28,7 +28,7 @@ with stop_signals_raise():
 @pytest.fixture
 def module(tmp_path, monkeypatch):
     (tmp_path / "works.py").write_text(WORKS)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(child.__file__).parents[2]}")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(arms.__file__).parents[2]}")
     monkeypatch.setattr(parent, "_TOLD_S", 0.01)
     return "works"
 
@@ -42,11 +42,11 @@ def wait_for(path: Path) -> None:
 
 def test_an_interrupted_study_lets_its_children_put_things_in_order(module, tmp_path):
     done: list[int] = []
-    command = [*child.this_module(module), str(tmp_path)]
-    thread = threading.Thread(target=lambda: done.append(child.run_program(command, {})))
+    command = [*arms.this_module(module), str(tmp_path)]
+    thread = threading.Thread(target=lambda: done.append(arms.run_program(command, {})))
     thread.start()
     wait_for(tmp_path / "began")
-    child.stop_running()
+    arms.stop_running()
     thread.join(PATIENCE_S)
     assert done == [0]
     assert (tmp_path / "ended").exists(), "the child had no time for its own end"
@@ -65,5 +65,5 @@ def test_an_interrupt_while_a_child_is_waited_for_stops_it(module, tmp_path, mon
 
     monkeypatch.setattr(Popen, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        child.run_program([*child.this_module(module), str(tmp_path)], {})
+        arms.run_program([*arms.this_module(module), str(tmp_path)], {})
     assert (tmp_path / "ended").exists()

@@ -274,12 +274,12 @@ def test_every_part_of_a_composite_policy_counts(mine, key, tmp_path):
 @pytest.fixture
 def remote(tmp_path, monkeypatch):
     """A remote policy's configuration, and what its server says of itself."""
-    from lerobot_roborecover.policies.remote import identity
+    from lerobot_roborecover.policies.remote import servers
     from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
 
     metadata: dict = {}
     server = SimpleNamespace(reach=lambda: metadata, close=lambda: None)
-    monkeypatch.setattr(identity, "make_server", lambda config, mapping: server)
+    monkeypatch.setattr(servers, "make_server", lambda config, mapping: server)
     mapping = tmp_path / "mine.yaml"
     text = "version: 1\nabout: a server\nimages: [{source: observation.image, key: image}]\n"
     mapping.write_text(text)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from lerobot_roborecover.curation.annotation.votes import ballot
 from lerobot_roborecover.utils.journal import read_journal
 from lerobot_roborecover.web.annotate.identity import queue_order
-from tests.support.browser import browsing
 from tests.support.candidate_files import SIDE
 
 EPISODES = 1000
@@ -15,24 +12,6 @@ EPISODES = 1000
 
 CALLED: dict[str, str] = {}
 """What annotators call an episode, by candidate id; the first episodes of every dataset here are the same."""
-
-
-@pytest.fixture(scope="module")
-def browse():
-    with browsing() as visit:
-        yield visit
-
-
-@pytest.fixture(scope="module")
-def visit(browse):
-    """Opens an address, and closes the guide that a first visit opens."""
-
-    def opened(url: str) -> tuple:
-        page, said = browse(url)
-        close_guide(page)
-        return page, said
-
-    return opened
 
 
 def close_guide(page) -> None:

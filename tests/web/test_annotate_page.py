@@ -26,10 +26,29 @@ from tests.support.annotation_page import (
     shown,
     votes,
 )
+from tests.support.browser import browsing
 from tests.support.candidate_files import CAMERAS, STEPS, candidate_dataset
 from tests.support.processes import PATIENCE_S
 
 pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def browse():
+    with browsing() as visit:
+        yield visit
+
+
+@pytest.fixture(scope="module")
+def visit(browse):
+    """Opens an address, and closes the guide that a first visit opens."""
+
+    def opened(url: str) -> tuple:
+        page, said = browse(url)
+        close_guide(page)
+        return page, said
+
+    return opened
 
 
 @pytest.fixture(scope="module")

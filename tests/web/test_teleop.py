@@ -28,13 +28,6 @@ from lerobot_roborecover.web.teleop.write import (
 from tests.support.candidate_files import candidate_dataset
 from tests.support.teleop_sessions import cockpit, push
 
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    with cockpit(tmp_path_factory.mktemp("r") / "set.recordings") as found:
-        yield found
-
-
 # --- what is recorded
 
 
