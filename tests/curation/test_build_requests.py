@@ -14,8 +14,7 @@ from lerobot_roborecover.cli.main import command_module, command_parser
 from lerobot_roborecover.cli.tree import find_call
 from lerobot_roborecover.curation.collect.options import CollectOptions
 from lerobot_roborecover.curation.pipeline import requests
-from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, ChainConfig, read_config
-from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, BuildPaths, ChainConfig, read_config
 from lerobot_roborecover.errors import OptionError
 from tests.curation.test_build import write
 

@@ -19,8 +19,7 @@ from typing import Any
 from lerobot_roborecover.curation.annotation.votes import check_name
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.pipeline import requests
-from lerobot_roborecover.curation.pipeline.config import ChainConfig
-from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.config import BuildPaths, ChainConfig
 from lerobot_roborecover.curation.pipeline.requests import assignments
 from lerobot_roborecover.curation.render import check_size
 from lerobot_roborecover.curation.screen.screening import CURTAILED_LEAST, ScreenRule

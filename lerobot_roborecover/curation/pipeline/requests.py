@@ -14,8 +14,13 @@ from typing import Any
 
 from lerobot_roborecover.curation.agree import AgreeRequest
 from lerobot_roborecover.curation.collect.options import CollectOptions
-from lerobot_roborecover.curation.pipeline.config import ChainConfig, CollectPart, Part, PublishPart
-from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.config import (
+    BuildPaths,
+    ChainConfig,
+    CollectPart,
+    Part,
+    PublishPart,
+)
 from lerobot_roborecover.curation.publishing import PublishRequest
 from lerobot_roborecover.curation.render import RenderRequest
 from lerobot_roborecover.curation.resolution import ResolutionConfig

@@ -25,8 +25,7 @@ from lerobot_roborecover.curation.candidates import CANDIDATES_FILE, STEPS_FILE,
 from lerobot_roborecover.curation.candidates_write import merge_candidates
 from lerobot_roborecover.curation.funnel import read_decisions
 from lerobot_roborecover.curation.pipeline import requests
-from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, ChainConfig
-from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.config import OLD_KEYS, BuildPaths, ChainConfig
 from lerobot_roborecover.curation.pipeline.work import StageRunners
 from lerobot_roborecover.curation.resolution import queued, resolve, write_discussion
 from lerobot_roborecover.datasets.schema import FOLDER

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.curation.funnel import StageCounts, attrition_table, count_stages, read_decisions
-from lerobot_roborecover.curation.pipeline.paths import BuildPaths
+from lerobot_roborecover.curation.pipeline.config import BuildPaths
 from lerobot_roborecover.curation.split_dataset import check_splits, format_report
 from lerobot_roborecover.datasets.schema import FOLDER
 from lerobot_roborecover.utils.atomic_io import atomic_write
