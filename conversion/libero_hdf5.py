@@ -19,7 +19,7 @@ from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.episodes import to_frame
 from lerobot_roborecover.datasets.hdf5 import episode_names, open_hdf5, read_array, read_group
-from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.datasets.licenses import add_license
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.libero.init_states import read_init_states
@@ -43,11 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--controller", "--driver", dest="driver", default="human", help="who acted (%(default)s)"
     )
-    parser.add_argument(
-        "--license",
-        type=license_argument,
-        help="licence by the Hub's identifier, of the data; none is assumed",
-    )
+    add_license(parser)
     args = parser.parse_args(argv)
     return write_converted(
         "libero_hdf5",

@@ -22,7 +22,7 @@ import numpy as np
 from lerobot_roborecover.cli.output import guarded
 from lerobot_roborecover.datasets.converted import each_source, write_converted
 from lerobot_roborecover.datasets.hdf5 import open_hdf5, read_array, read_group
-from lerobot_roborecover.datasets.licenses import license_argument
+from lerobot_roborecover.datasets.licenses import add_license
 from lerobot_roborecover.datasets.release.tables import read_file
 from lerobot_roborecover.datasets.trajectory_write import Frame, Trajectory
 from lerobot_roborecover.platforms import platform_named
@@ -45,11 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--fps", type=int, default=25, help="frame rate, as LeRobot's env has it (%(default)s)"
     )
-    parser.add_argument(
-        "--license",
-        type=license_argument,
-        help="licence by the Hub's identifier, of the data; none is assumed",
-    )
+    add_license(parser)
     args = parser.parse_args(argv)
     return write_converted(
         "robotwin_hdf5",

@@ -59,3 +59,9 @@ def license_argument(text: str) -> str:
     except ScenarioError as err:
         raise argparse.ArgumentTypeError(str(err)) from None
     return text
+
+
+def add_license(parser: argparse.ArgumentParser) -> None:
+    """Adds the option `--license` of a script that converts data."""
+    text = "licence by the Hub's identifier, of the data; none is assumed"
+    parser.add_argument("--license", type=license_argument, help=text)

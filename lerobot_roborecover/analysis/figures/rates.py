@@ -8,32 +8,11 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_roborecover.analysis.figures import style
 from lerobot_roborecover.analysis.figures.prefix import prefix_figure
 from lerobot_roborecover.analysis.figures.retries import retries
 from lerobot_roborecover.analysis.figures.runs import runs_figure
 from lerobot_roborecover.analysis.figures.slope import slope
-from lerobot_roborecover.analysis.figures.style import (
-    HEAT,
-    INK,
-    LINE,
-    MOST_ROWS,
-    ON_COLOUR,
-    ON_LIGHT,
-    PAPER,
-    SOFT,
-    Figure,
-    Plot,
-    Width,
-    both,
-    colour,
-    drawing,
-    marker,
-    name_rows,
-    number,
-    row_height,
-    short,
-    the_best,
-)
 from lerobot_roborecover.analysis.figures.trials import interventions, mosaic, oracle_bars, time_to_recover
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
@@ -44,7 +23,7 @@ MOST_COLUMNS = {False: 24, True: 10}
 """Policies that a heat map shows, the best first, by whether it is narrow; its table has all."""
 
 
-def all_figures(results: Results) -> list[Figure]:
+def all_figures(results: Results) -> list[style.Figure]:
     """Every figure that the study has something for."""
     figures = [forest(results)]
     if results.several_runs:
@@ -70,47 +49,57 @@ def all_figures(results: Results) -> list[Figure]:
     return figures
 
 
-def forest(results: Results) -> Figure:
+def forest(results: Results) -> style.Figure:
     """RSR with intervals, best first; initial-state rates as hollow markers with theirs."""
     panel, chosen = results.recovery, results.compared.policies
     rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
-    order = [chosen[p] for p in reversed(results.best_first[:MOST_ROWS])]
+    order = [chosen[p] for p in reversed(results.best_first[: style.MOST_ROWS])]
     level = f"{100 * results.draws.level:g} % interval"
 
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
-            plot, axes = subplots(width.inches, 0.8 + row_height(width, 0.46) * len(order))
+    def draw(width: style.Width) -> style.Plot:
+        with style.drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.8 + style.row_height(width, 0.46) * len(order))
             for y, p in enumerate(order):
                 if not math.isnan(initial[p].value):
                     at = y - 0.2
                     if not math.isnan(initial[p].low):
-                        axes.plot([100 * initial[p].low, 100 * initial[p].high], [at, at], color=SOFT, lw=1.2)
-                    axes.plot(100 * initial[p].value, at, "o", color=SOFT, mfc=PAPER, ms=5.5)
+                        axes.plot(
+                            [100 * initial[p].low, 100 * initial[p].high], [at, at], color=style.SOFT, lw=1.2
+                        )
+                    axes.plot(100 * initial[p].value, at, "o", color=style.SOFT, mfc=style.PAPER, ms=5.5)
                 if not math.isnan(rsr[p].low):
-                    axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=colour(p), lw=3)
-                axes.plot(100 * rsr[p].value, y, marker(p), color=colour(p), ms=9, mec=PAPER, mew=1)
+                    axes.plot([100 * rsr[p].low, 100 * rsr[p].high], [y, y], color=style.colour(p), lw=3)
+                axes.plot(
+                    100 * rsr[p].value,
+                    y,
+                    style.marker(p),
+                    color=style.colour(p),
+                    ms=9,
+                    mec=style.PAPER,
+                    mew=1,
+                )
                 if not width.narrow:
                     at = 100 * rsr[p].value, y
                     value = f"{100 * rsr[p].value:.1f}"
                     axes.annotate(value, at, (0, 8), textcoords="offset points", ha="center", fontsize=9)
-            names = [short(panel.arms[p], width.names) for p in order]
+            names = [style.short(panel.arms[p], width.names) for p in order]
             if width.narrow:  # beside the name: above the row's end the value would be read as another mark's
                 names = [f"{name}  {100 * rsr[p].value:.1f}" for name, p in zip(names, order, strict=True)]
-            name_rows(axes, names, width)
+            style.name_rows(axes, names, width)
             axes.set(xlim=(-1, 101), ylim=(-0.6, len(order) - 0.15))
             hollow = any(not math.isnan(e.value) for e in initial)
             texts = [f"RSR, %, with {level}", "hollow: from initial states"][: 1 + hollow]
             axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
-            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.grid(axis="x", color=style.LINE, lw=0.6)
             axes.set_axisbelow(True)
             axes.spines["left"].set_visible(False)
         return plot
 
     words = "; ".join(f"{panel.arms[p]} {_words(rsr[p])}" for p in reversed(order))
-    text = the_best(f"RSR in per cent, best first: {words}.", len(order), len(chosen))
+    text = style.the_best(f"RSR in per cent, best first: {words}.", len(order), len(chosen))
     if results.left_out:
         text += f" Not ranked, because not run on all scenarios: {', '.join(results.left_out)}."
-    return Figure("forest", "Recovery success rate", text, *both(draw))
+    return style.Figure("forest", "Recovery success rate", text, *style.both(draw))
 
 
 def _words(estimate: Estimate) -> str:
@@ -119,7 +108,7 @@ def _words(estimate: Estimate) -> str:
     return f"{100 * estimate.value:.1f} ({100 * estimate.low:.1f} to {100 * estimate.high:.1f})"
 
 
-def cell_heat_map(results: Results) -> Figure:
+def cell_heat_map(results: Results) -> style.Figure:
     """Cells × policies; sparse cells hatched and pale, counts in the labels."""
     groups = group_rates(results.recovery, "cell", results.draws)
     labels = [f"{g.label.replace('-', ', ', 1)}  (N={g.scenarios})" for g in groups]
@@ -128,16 +117,16 @@ def cell_heat_map(results: Results) -> Figure:
     plots = _heat_map(values, labels, results.recovery.arms, sparse)
     arms = results.recovery.arms[: MOST_COLUMNS[False]]
     words = "; ".join(
-        f"{label}: {', '.join(f'{a} {number(100 * v)}' for a, v in zip(arms, row, strict=False))}"
+        f"{label}: {', '.join(f'{a} {style.number(100 * v)}' for a, v in zip(arms, row, strict=False))}"
         for label, row in zip(labels, values, strict=True)
     )
-    text = the_best(f"RSR in per cent. {words}.", len(arms), len(results.recovery.arms))
-    return Figure("cells", "Recovery by stage and deviation type", text, *plots)
+    text = style.the_best(f"RSR in per cent. {words}.", len(arms), len(results.recovery.arms))
+    return style.Figure("cells", "Recovery by stage and deviation type", text, *plots)
 
 
-def source_heat_map(results: Results, matrix: Sequence) -> Figure:
+def source_heat_map(results: Results, matrix: Sequence) -> style.Figure:
     """Source policies × recovery policies."""
-    labels = [f"{short(row.source_policy)}  (N={row.scenarios})" for row in matrix]
+    labels = [f"{style.short(row.source_policy)}  (N={row.scenarios})" for row in matrix]
     values = np.array([[e.value for e in row.rates] for row in matrix])
     solid = [(i, row.own) for i, row in enumerate(matrix) if row.own is not None]
     dashed = [(i, row.best_other) for i, row in enumerate(matrix) if row.best_other is not None]
@@ -145,13 +134,13 @@ def source_heat_map(results: Results, matrix: Sequence) -> Figure:
     plots = _heat_map(values, labels, results.recovery.arms, sparse, solid, dashed)
     words = "; ".join(
         f"scenarios of {row.source_policy}: best other {results.recovery.arms[row.best_other]} "
-        f"{number(100 * row.rates[row.best_other].value)}"
-        + (f", itself {number(100 * row.rates[row.own].value)}" if row.own is not None else "")
+        f"{style.number(100 * row.rates[row.best_other].value)}"
+        + (f", itself {style.number(100 * row.rates[row.own].value)}" if row.own is not None else "")
         for row in matrix
         if row.best_other is not None
     )
     text = f"RSR in per cent; solid outline: the source policy itself, dashed: observed best other. {words}"
-    return Figure("source_matrix", "Who recovers from whose deviations", text, *plots)
+    return style.Figure("source_matrix", "Who recovers from whose deviations", text, *plots)
 
 
 def _heat_map(
@@ -161,45 +150,45 @@ def _heat_map(
     sparse: Sequence[bool],
     solid: Sequence[tuple[int, int]] = (),
     dashed: Sequence[tuple[int, int]] = (),
-) -> tuple[Plot, Plot]:
+) -> tuple[style.Plot, style.Plot]:
     """Rows × policies as coloured fields with their numbers, wide and narrow."""
     from matplotlib import colormaps
     from matplotlib.patches import Rectangle
 
-    shades = colormaps[HEAT]
+    shades = colormaps[style.HEAT]
     every, all_values = policies, values
 
-    def draw(width: Width) -> Plot:
+    def draw(width: style.Width) -> style.Plot:
         policies = every[: MOST_COLUMNS[width.narrow]]
         values = all_values[:, : len(policies)]
-        with drawing() as subplots:
-            tall = row_height(width, 0.44)
+        with style.drawing() as subplots:
+            tall = style.row_height(width, 0.44)
             plot, axes = subplots(width.inches, 0.9 + tall * len(labels) + 0.25 * width.narrow)
             for i, j in np.ndindex(values.shape):
                 known = math.isfinite(values[i, j])
                 low = 0.16 if width.narrow else 0.46
                 field = Rectangle(
                     (j - 0.48, i - low), 0.96, low + 0.46, fc=shades(values[i, j]) if known else "none",
-                    ec=LINE if not known or sparse[i] else "none", lw=0.8, alpha=0.55 if sparse[i] else 1,
-                    hatch="///" if sparse[i] and known else None,
+                    ec=style.LINE if not known or sparse[i] else "none", lw=0.8,
+                    alpha=0.55 if sparse[i] else 1, hatch="///" if sparse[i] and known else None,
                 )  # fmt: skip
                 axes.add_patch(field)
                 dark = known and values[i, j] < 0.55
                 text = axes.text(
-                    j, i + (0.46 - low) / 2, number(100 * values[i, j]), ha="center", va="center",
-                    color=ON_COLOUR if dark else ON_LIGHT if known else SOFT,
+                    j, i + (0.46 - low) / 2, style.number(100 * values[i, j]), ha="center", va="center",
+                    color=style.ON_COLOUR if dark else style.ON_LIGHT if known else style.SOFT,
                 )  # fmt: skip
                 if sparse[i] and known:
                     text.set_bbox({"fc": shades(values[i, j]), "ec": "none", "pad": 1.5})
-            for cells, style in ((dashed, (0, (4, 2))), (solid, "-")):
+            for cells, dashes in ((dashed, (0, (4, 2))), (solid, "-")):
                 for i, j in (cell for cell in cells if cell[1] < len(policies)):
                     low = 0.12 if width.narrow else 0.42
                     corner, size = (j - 0.44, i - low), (0.88, low + 0.42)
-                    axes.add_patch(Rectangle(corner, *size, fill=False, ec=ON_COLOUR, lw=4))
-                    axes.add_patch(Rectangle(corner, *size, fill=False, ec="#d55e00", lw=2, ls=style))
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec=style.ON_COLOUR, lw=4))
+                    axes.add_patch(Rectangle(corner, *size, fill=False, ec="#d55e00", lw=2, ls=dashes))
             tilt = {"rotation": 30, "ha": "left", "rotation_mode": "anchor"} if width.narrow else {}
             limit = 14 if width.narrow else max(8, int(120 / len(policies)))
-            axes.set_xticks(range(len(policies)), [short(p, limit) for p in policies], **tilt)
+            axes.set_xticks(range(len(policies)), [style.short(p, limit) for p in policies], **tilt)
             axes.xaxis.tick_top()
             if width.narrow:
                 axes.set_yticks([])
@@ -210,14 +199,14 @@ def _heat_map(
             axes.set(xlim=(-0.5, len(policies) - 0.5), ylim=(len(labels) - 0.5, -0.62))
             if len(policies) < len(every):
                 axes.set_xlabel(f"the best {len(policies)} of {len(every)} policies")
-            axes.tick_params(length=0, labelcolor=INK)
+            axes.tick_params(length=0, labelcolor=style.INK)
             axes.spines[:].set_visible(False)
         return plot
 
-    return both(draw)
+    return style.both(draw)
 
 
-def paired_differences(results: Results) -> Figure:
+def paired_differences(results: Results) -> style.Figure:
     """All pairs with their intervals; separated ones filled."""
     pairs = set(results.shown_pairs)
     every = zip(combinations(range(len(results.recovery.arms)), 2), results.contrasts, strict=True)
@@ -225,23 +214,25 @@ def paired_differences(results: Results) -> Figure:
     shown = [c for c in found if not math.isnan(c.difference.value)]
     level = f"{100 * results.draws.level:g} % interval"
 
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
-            plot, axes = subplots(width.inches, 0.9 + row_height(width, 0.3) * max(1, len(shown)))
-            axes.axvline(0, color=SOFT, lw=1)
+    def draw(width: style.Width) -> style.Plot:
+        with style.drawing() as subplots:
+            plot, axes = subplots(width.inches, 0.9 + style.row_height(width, 0.3) * max(1, len(shown)))
+            axes.axvline(0, color=style.SOFT, lw=1)
             for y, c in enumerate(shown):
                 d = c.difference
                 clear = c.verdict.separated
-                shade = colour(0) if clear else SOFT
+                shade = style.colour(0) if clear else style.SOFT
                 if not math.isnan(d.low):
                     axes.plot([100 * d.low, 100 * d.high], [y, y], color=shade, lw=2.2)
-                axes.plot(100 * d.value, y, "o", color=shade, mfc=shade if clear else PAPER, ms=7)
+                axes.plot(100 * d.value, y, "o", color=shade, mfc=shade if clear else style.PAPER, ms=7)
             limit = 15 if width.narrow else 22
-            name_rows(axes, [f"{short(c.a, limit)} − {short(c.b, limit)}" for c in shown], width)
+            style.name_rows(
+                axes, [f"{style.short(c.a, limit)} − {style.short(c.b, limit)}" for c in shown], width
+            )
             axes.set(ylim=(-0.7, max(1, len(shown)) - (0.1 if width.narrow else 0.3)))
             texts = f"RSR, A − B, points, with {level}", "filled: separated (Holm)"
             axes.set_xlabel(("\n" if width.narrow else "; ").join(texts))
-            axes.grid(axis="x", color=LINE, lw=0.6)
+            axes.grid(axis="x", color=style.LINE, lw=0.6)
             axes.set_axisbelow(True)
             axes.spines["left"].set_visible(False)
         return plot
@@ -253,4 +244,4 @@ def paired_differences(results: Results) -> Figure:
             f"{results.recovery.arms[0]} against every other policy: {text} The table has all "
             f"{len(results.contrasts)} pairs."
         )
-    return Figure("paired_differences", "Paired differences in RSR", text, *both(draw))
+    return style.Figure("paired_differences", "Paired differences in RSR", text, *style.both(draw))

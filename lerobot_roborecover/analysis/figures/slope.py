@@ -7,19 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_roborecover.analysis.figures.style import (
-    LINE,
-    SOFT,
-    Figure,
-    Plot,
-    Width,
-    both,
-    colour,
-    drawing,
-    marker,
-    short,
-    the_best,
-)
+from lerobot_roborecover.analysis.figures import style
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.intervals import Estimate
@@ -34,7 +22,7 @@ _APART = 5.2
 """Per cent between two labels, so that they do not overlap."""
 
 
-def slope(results: Results) -> Figure | None:
+def slope(results: Results) -> style.Figure | None:
     """Initial against recovery success, with intervals; None where no ranked policy has both."""
     chosen = results.compared.policies
     rsr, initial = dict(zip(chosen, results.ranked_rates, strict=True)), initial_estimates(results)
@@ -54,7 +42,7 @@ def slope_of(
     rsr: Sequence[Estimate],
     of: int,
     styles: Sequence[int] | None = None,
-) -> Figure:
+) -> style.Figure:
     """Returns the graph of these policies.
 
     Args:
@@ -67,16 +55,18 @@ def slope_of(
     ends = [initial, rsr]
     looks = styles or range(len(names))
 
-    def draw(width: Width) -> Plot:
-        with drawing() as subplots:
+    def draw(width: style.Width) -> style.Plot:
+        with style.drawing() as subplots:
             plot, axes = subplots(width.inches if width.narrow else _INCHES, 4.2)
             for p, name, before, after in zip(looks, names, *ends, strict=True):
                 values = [100 * before.value, 100 * after.value]
-                axes.plot([0, 1], values, marker(p), ls="-", color=colour(p), lw=2.4, ms=8.5, label=name)
+                axes.plot(
+                    [0, 1], values, style.marker(p), ls="-", color=style.colour(p), lw=2.4, ms=8.5, label=name
+                )
                 for x, estimate in ((0, before), (1, after)):
                     if not math.isnan(estimate.low):
                         bounds = [100 * estimate.low, 100 * estimate.high]
-                        axes.plot([x, x], bounds, color=colour(p), lw=1.4, alpha=0.55)
+                        axes.plot([x, x], bounds, color=style.colour(p), lw=1.4, alpha=0.55)
             limit, size, gap = (14, 8.5, "\n") if width.narrow else (22, 9.5, " ")
             places = [_spread_out([100 * e.value for e in end]) for end in ends]
             for k, (p, name) in enumerate(zip(looks, names, strict=True)):
@@ -85,7 +75,7 @@ def slope_of(
                 for x, side in ((0, -1), (1, 1)):
                     at = x + side * _GAP
                     # From the mark to its label, which may stand higher or lower.
-                    axes.plot([x, at], [values[x], places[x][k]], color=colour(p), lw=0.8, alpha=0.7)
+                    axes.plot([x, at], [values[x], places[x][k]], color=style.colour(p), lw=0.8, alpha=0.7)
                     where = {"ha": "right" if side < 0 else "left", "va": "center", "fontsize": size}
                     axes.text(at + side * 0.015, places[x][k], texts[x], **where)
             every_place = np.concatenate(places)
@@ -98,17 +88,19 @@ def slope_of(
             )  # fmt: skip
             axes.set_yticks([])
             for x in (0, 1):
-                axes.axvline(x, color=LINE, lw=1, zorder=0)
+                axes.axvline(x, color=style.LINE, lw=1, zorder=0)
             axes.spines[:].set_visible(False)
-            axes.tick_params(length=0, labelcolor=SOFT)
+            axes.tick_params(length=0, labelcolor=style.SOFT)
         return plot
 
-    return Figure("slope", "From initial states to recovery points", _words(names, ends, of), *both(draw))
+    return style.Figure(
+        "slope", "From initial states to recovery points", _words(names, ends, of), *style.both(draw)
+    )
 
 
 def _short(name: str, limit: int) -> str:
     """A name that fits: its beginning and its end, since names of one series differ at their ends."""
-    return short(name if len(name) <= limit else f"{name[: limit - 9]}…{name[-8:]}", limit)
+    return style.short(name if len(name) <= limit else f"{name[: limit - 9]}…{name[-8:]}", limit)
 
 
 def _words(names: Sequence[str], ends: Sequence[Sequence[Estimate]], count: int) -> str:
@@ -119,7 +111,7 @@ def _words(names: Sequence[str], ends: Sequence[Sequence[Estimate]], count: int)
     text = (
         f"Success in per cent from initial states and from recovery points, best at recovery first: {pairs}."
     )
-    return the_best(text, len(names), count)
+    return style.the_best(text, len(names), count)
 
 
 def _spread_out(values: Sequence[float]) -> np.ndarray:
