@@ -7,7 +7,7 @@ each finished trial.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
@@ -108,18 +108,45 @@ def run_work_items(
         PolicyFailedError: the first trials ended in the same policy error, before any action.
         SimulatorError: no simulator can be made.
     """
-    todo = unfinished(run, items)
-    if not todo:
-        return RunResult()
-    if not run.rows():  # of a run that goes on, the policy is known to act
-        policy_type = run.protocol.policy_settings.get("policy_type")
-        options["first"] = FirstTrials(len(todo), policy_type, remedy)
-    try:
-        engine = open_engine(run, todo, make_host, config, stop=stop, **options)
-    except CallStoppedError:  # before the policy was loaded
-        return RunResult()
-    finished = engine.run(todo, stop)
-    return RunResult(finished, engine.reruns, engine.unrun)
+    return run_passes(run, [items], make_host, config, stop=stop, remedy=remedy, **options)
+
+
+def run_passes(
+    run: EvalSession,
+    passes: Iterable[Sequence[WorkItem]],
+    make_host: Callable[[], PolicyRunner],
+    config: EngineConfig,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    remedy: str = "",
+    most: int | None = None,
+    **options: Any,
+) -> RunResult:
+    """`run_work_items` for several lists; simulators and policy are started once.
+
+    Args:
+        run, make_host, config, stop, remedy, options: of `run_work_items`.
+        passes: lists of trials, each asked for once the one before has ended. After a trial that could not be
+            run, none is asked for.
+        most: trials in any list, at most; None takes the first list's.
+    """
+    engine, finished = None, 0
+    for items in passes:
+        todo = unfinished(run, items)
+        if not todo:
+            continue
+        if engine is None:
+            if not run.rows():  # of a run that goes on, the policy is known to act
+                kind = run.protocol.policy_settings.get("policy_type")
+                options["first"] = FirstTrials(len(todo), kind, remedy)
+            try:
+                engine = open_engine(run, todo, make_host, config, stop=stop, most=most, **options)
+            except CallStoppedError:  # before the policy was loaded
+                break
+        finished += engine.run(todo, stop)
+        if engine.unrun:
+            break
+    return RunResult() if engine is None else RunResult(finished, engine.reruns, engine.unrun)
 
 
 def open_engine(
@@ -129,6 +156,7 @@ def open_engine(
     config: EngineConfig,
     *,
     stop: Callable[[], bool] = lambda: False,
+    most: int | None = None,
     **options: Any,
 ) -> Engine:
     """Starts simulators, each of which makes its simulator first, and a picture where it is to draw; and the
@@ -140,6 +168,7 @@ def open_engine(
         make_host: loads the policy, as for `run_work_items`.
         config: where.
         stop: asked while a policy loads on this machine; True gives up.
+        most: simulators that have something to do, at most; None takes one for each of `units`.
         options: of `Engine`.
 
     Raises:
@@ -148,7 +177,7 @@ def open_engine(
         SimulatorError: no simulator can be made.
     """
     if not config.workplace.on_cluster:
-        return _open_local_engine(run, units, make_host, config, stop, options)
+        return _open_local_engine(run, units, make_host, config, stop, most or len(units), options)
     from lerobot_roborecover.evaluation.ray_engine import open_ray_engine
 
     startup = WorkerStartup(first=("fingerprint", None), check=check_first_reply)
@@ -165,7 +194,7 @@ def open_engine(
         gpus=1.0 if config.device.startswith("cuda") else 0.0,
         startup=startup,
         snapshot_dir=config.snapshot_dir,
-        most=len(units),
+        most=most or len(units),
         **options,
     )
 
@@ -176,6 +205,7 @@ def _open_local_engine(
     make_host: Callable[[], PolicyRunner],
     config: EngineConfig,
     stop: Callable[[], bool],
+    most: int,
     options: Mapping[str, Any],
 ) -> Engine:
     """Starts worker processes, has each make its first task and a picture while the policy loads in this
@@ -183,7 +213,7 @@ def _open_local_engine(
     if config.draws:
         run.pool.configure(environment=render_environment(config.render_device, config.device, egl_devices()))
     slots = config.slots or default_slots(config.device, usable_cores(), available_gb())
-    workers = run.pool.worker_slots(min(slots, len(units)))
+    workers = run.pool.worker_slots(min(slots, most))
     begun = list(zip(workers, first_units(units, len(workers)), strict=False))
     for worker, unit in begun:
         worker.send(*(("smoke", unit.scenario) if config.draws else ("fingerprint",)))

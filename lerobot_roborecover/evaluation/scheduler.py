@@ -135,6 +135,7 @@ class Engine:
             PolicyFailedError: the first trials failed alike.
         """
         self._queue = self._queue_of(unfinished(self._run, units))
+        self._failures, self._losses = {}, {}
         self._finished, self._stop = 0, stop
         while not stop():
             self._fill()

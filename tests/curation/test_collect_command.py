@@ -261,6 +261,8 @@ def test_rollouts_whose_policy_was_away_are_told_and_left_for_another_run(tmp_pa
             return 0
 
     monkeypatch.setattr("lerobot_roborecover.evaluation.launch.open_engine", lambda *_, **__: Away())
-    planned = SimpleNamespace(seed=0, trial=0, driver="p")
+    planned = SimpleNamespace(seed=0, trial=0)
     with pytest.raises(ScenarioError, match=r"1 trial could not be run.*nobody answers.*command again"):
-        run_policy([[planned]], None, None, None, 7, lambda ended, record: None)
+        run_policy(
+            [[planned], []], None, None, None, driver="p", seed=7, most=1, on_end=lambda ended, record: None
+        )

@@ -21,6 +21,7 @@ from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.workers.messages import SlotFailure
 from tests.curation.test_collect_command import arguments, meaning
 from tests.support.factories import fake_scenario, save_policy
+from tests.support.processes import PATIENCE_S
 from tests.support.ray_cluster import two_nodes
 
 pytestmark = [pytest.mark.ray, pytest.mark.lerobot, pytest.mark.slow, pytest.mark.nightly]
@@ -45,37 +46,46 @@ def run(monkeypatch):
 
 
 @contextmanager
-def node_dies(cluster, monkeypatch, owner, name: str, after: int):
-    """A node dies once a function has been called so often.
+def node_dies(cluster, monkeypatch, during: str = ""):
+    """The second node dies while a simulator on it is at its first command.
 
-    Yields:
-        What was lost with it, as slots told.
+    Args:
+        cluster: of two nodes.
+        monkeypatch: of the test.
+        during: the command that it dies in; empty takes any.
     """
+    import ray
+
     from lerobot_roborecover.workers.cluster import RaySlot
 
     cluster.complete()
-    counted, lost = [], []
-    original, receive = getattr(owner, name), RaySlot.receive
+    before, slots, replies = cluster.lost, [], []
+    make, send, receive = RaySlot.__init__, RaySlot.send, RaySlot.receive
 
-    def counting(*args, **kwargs):
-        result = original(*args, **kwargs)
-        counted.append(name)
-        if len(counted) == after:
+    def making(slot, *args):
+        make(slot, *args)
+        slots.append(slot)
+
+    def sending(slot, command, argument=None):
+        if cluster.lost == before:  # all are there, so that the second node's simulators have a share
+            ray.wait([each.ready for each in slots], num_returns=len(slots), timeout=PATIENCE_S)
+        send(slot, command, argument)
+        if cluster.lost == before and during in ("", command) and cluster.second_has(slot._actor):
             cluster.lose_a_node()
-        return result
 
-    def noting(slot):
+    def receiving(slot):
         reply = receive(slot)
-        if isinstance(reply, SlotFailure):
-            lost.append(reply.kind)
+        if cluster.lost > before:
+            replies.append(reply.kind if isinstance(reply, SlotFailure) else "done")
         return reply
 
     with monkeypatch.context() as patch:
-        patch.setattr(owner, name, counting)
-        patch.setattr(RaySlot, "receive", noting)
-        yield lost
-    assert len(counted) > after, "there was more to do"
-    assert set(lost) == {"lost"}
+        patch.setattr(RaySlot, "__init__", making)
+        patch.setattr(RaySlot, "send", sending)
+        patch.setattr(RaySlot, "receive", receiving)
+        yield
+    assert cluster.lost == before + 1
+    assert set(replies) == {"lost", "done"}
 
 
 def journal(path: Path) -> list[str]:
@@ -86,7 +96,7 @@ def journal(path: Path) -> list[str]:
 def test_an_experts_rollouts(cluster, run, monkeypatch, tmp_path):
     asked = ["--expert=expert_biased", "--seeds=0-7", "--perturb", "--frames=32", f"--env.{SLOW}"]
     assert run(*arguments(tmp_path / "here", *asked)) == 0
-    with node_dies(cluster, monkeypatch, RolloutJournal, "add", after=4):
+    with node_dies(cluster, monkeypatch):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=0")) == 0
     assert meaning(tmp_path / "ray") == meaning(tmp_path / "here")
     files = [journal(tmp_path / f"{name}.work" / "rollouts.jsonl") for name in ("here", "ray")]
@@ -96,11 +106,9 @@ def test_an_experts_rollouts(cluster, run, monkeypatch, tmp_path):
 
 def test_a_film(cluster, run, monkeypatch, tmp_path):
     """The replays for the pictures are on the cluster, too."""
-    from lerobot_roborecover.curation.collect import write
-
     asked = ["--expert=expert_biased", "--seeds=0-4", "--frames=32", f"--env.{SLOW}", "--part-size=4"]
     assert run(*arguments(tmp_path / "here", *asked)) == 0
-    with node_dies(cluster, monkeypatch, write, "_recording", after=2):
+    with node_dies(cluster, monkeypatch, "render"):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=4")) == 0
     assert meaning(tmp_path / "ray") == meaning(tmp_path / "here")
 
@@ -116,7 +124,7 @@ def test_a_policys_rollouts(cluster, run, monkeypatch, tmp_path):
     ]
     asked += [f"--env.{SLOW}", "--perturb", "--min-displacement=1"]
     assert run(*arguments(tmp_path / "here", *asked)) in (0, 1)
-    with node_dies(cluster, monkeypatch, RolloutJournal, "add", after=3):
+    with node_dies(cluster, monkeypatch):
         assert run(*arguments(tmp_path / "ray", *asked, "--engine=ray", "--slots=3")) in (0, 1)
     books = [tmp_path / f"{name}.work" for name in ("here", "ray")]
     here, ray = (journal(book / "rollouts.jsonl") for book in books)
@@ -168,22 +176,18 @@ def screening(scenarios, tmp_path_factory):
 
 
 def test_a_screening(cluster, run, monkeypatch, tmp_path, screening):
-    from lerobot_roborecover.curation import policy_trials
-
     asked, here = screening
-    with node_dies(cluster, monkeypatch, policy_trials, "_keep_actions", after=4):
+    with node_dies(cluster, monkeypatch):
         assert run(*asked, "--engine=ray", "--slots=3", "--out", tmp_path / "ray") == 0
     assert screened(tmp_path / "ray") == screened(here)
     assert len(read_scenarios(tmp_path / "ray")) == 6
 
 
 def test_a_validation(cluster, run, monkeypatch, tmp_path, screening):
-    from lerobot_roborecover.curation.validate import dataset
-
     _, here = screening
     asked = ["validate", here, "--trials-folder", f"{here}.trials", "--env", SLOW]
     assert run(*asked, "--workers=2", "--out", tmp_path / "here") == 0
-    with node_dies(cluster, monkeypatch, dataset, "_report_of", after=1):
+    with node_dies(cluster, monkeypatch):
         assert run(*asked, "--engine=ray", "--out", tmp_path / "ray") == 0
     folders = [Path(f"{tmp_path / name}.replays") for name in ("here", "ray")]
     assert journal(folders[0] / "replays.jsonl") == journal(folders[1] / "replays.jsonl")

@@ -91,10 +91,20 @@ class TwoNodes:
 
     def complete(self) -> TwoNodes:
         """Has the second node there, again."""
+        import ray
+
         if self._second is None:
             self._second = self._cluster.add_node(**node_arguments())
             self._cluster.wait_for_nodes(PATIENCE_S)
+            while ray.cluster_resources().get("CPU") != 2 * SMALL["num_cpus"]:
+                time.sleep(0.05)
         return self
+
+    def second_has(self, actor: Any) -> bool:
+        """Whether an actor that has started is on the second node."""
+        from ray._private.state import actors
+
+        return actors(actor._actor_id.hex())["Address"]["NodeID"] == self._second.node_id
 
     def lose_a_node(self) -> None:
         """Takes the second node away, with everything on it: what its raylet has started would live on for a

@@ -114,7 +114,10 @@ def run_policy(
     pool: SlotPool,
     make_host: Callable[[], Any],
     places: Any,
+    *,
+    driver: str,
     seed: int,
+    most: int,
     on_end: OnEnd,
 ) -> None:
     """Lets a policy drive, through the engine.
@@ -124,14 +127,16 @@ def run_policy(
             pass have different ids.
         pool: of slots with `collect_server.SERVER`.
         make_host: loads the policy.
-        places: where, `an `EngineConfig` of `evaluation.launch``.
+        places: where, an `EngineConfig` of `evaluation.launch`.
+        driver: the policy's name in the rollouts.
         seed: of the run; a trial's noise comes from it and from the rollout's id.
+        most: rollouts in a pass, at most.
         on_end: called with each.
 
     Raises:
         ScenarioError: the policy went away, so that some were not driven.
     """
-    from lerobot_roborecover.evaluation.launch import run_work_items
+    from lerobot_roborecover.evaluation.launch import run_passes
 
     def keep(trial: Trial, row: TrialRow) -> None:
         assert isinstance(trial.scenario, RolloutSpec)
@@ -139,8 +144,7 @@ def run_policy(
             RolloutOutcome(trial.scenario.record_name, row.outcome, row.steps, row.reason), trial.attachment
         )
 
-    for wanted in passes:
-        units = [WorkItem(u, u.trial) for u in wanted]
-        protocol = EvalProtocol("recovery", 0, wanted[0].driver if wanted else "", seed, None)
-        run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, on_trial_end=keep)
-        run_work_items(run, units, make_host, places).check_all_run()
+    protocol = EvalProtocol("recovery", 0, driver, seed, None)
+    run = EvalSession(pool, protocol, None, "collect", None, handoff_check=False, on_trial_end=keep)
+    items = ([WorkItem(u, u.trial) for u in wanted] for wanted in passes)
+    run_passes(run, items, make_host, places, most=most).check_all_run()

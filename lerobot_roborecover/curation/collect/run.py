@@ -96,7 +96,7 @@ def roll_out(
             for wanted in passes():
                 run_expert(wanted, pool, count, on_end)
         else:
-            _run_policy(options, env, passes(), pool, draws, on_end)
+            _run_policy(options, env, passes(), pool, draws, units[0].driver, left, on_end)
         line.show(progress, final=True)
     finally:
         pool.release()
@@ -128,6 +128,8 @@ def _run_policy(
     passes: Iterable[Sequence[RolloutSpec]],
     pool: SlotPool,
     draws: bool,
+    driver: str,
+    most: int,
     on_end: OnEnd,
 ) -> None:
     from lerobot_roborecover.evaluation import loading
@@ -142,7 +144,8 @@ def _run_policy(
         )
     spec = loading.HostSpec(config, env, options.rename_map or {}, options.seed, options.max_batch)
     places = EngineConfig(options.workplace, options.num_workers, options.replicas, str(config.device), draws)
-    run_policy(passes, pool, partial(loading.load_host, spec), places, options.seed, on_end)
+    host = partial(loading.load_host, spec)
+    run_policy(passes, pool, host, places, driver=driver, seed=options.seed, most=most, on_end=on_end)
 
 
 def render_and_write(
