@@ -63,6 +63,7 @@ def map_unordered[Item](
                 if not slots[k].starting and (handed := next_for(k)) is not None:
                     slots[k].send(command, argument(handed.item))
                     busy[k], last[k] = handed, handed.item
+            idle = [k for k in idle if k not in busy]
             # Only an item at hand says that slots which are starting are still needed.
             if idle and all(slots[k].starting for k in idle) and (handed := next_for(idle[0])) is not None:
                 waiting.appendleft(handed)
