@@ -115,3 +115,16 @@ def test_what_died_by_itself_is_not_tried_again():
     assert found == {0: 0, 1: SlotFailure("died", "it died"), 2: 2}
     assert set(counts.values()) == {1}
     assert slot.ended == 3, "a fresh process for each"
+
+
+def test_slots_that_start_late_join_the_work():
+    counts: Counter[int] = Counter()
+    slots = slots_of([0, 1], [], counts)
+    used = set()
+    for slot in slots:
+        slot.send = lambda command, argument=None, slot=slot: (
+            used.add(slot), FragileSlot.send(slot, command, argument)
+        )  # fmt: skip
+    left = iter(range(4))
+    assert len(list(map_unordered(slots, "run", lambda *_: next(left, None), lambda item: item))) == 4
+    assert used == set(slots)
