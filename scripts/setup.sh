@@ -28,6 +28,19 @@ still() {
 # Chromium for the tests of pages, and what builds egl_probe, which LIBERO asks for and which has no wheels.
 system_packages=(libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 mesa-vulkan-drivers libx11-6 ffmpeg chromium git cmake make g++)
 
+case "${1:-}" in
+    "" | --system | --lerobot-main) ;;
+    -h | --help)
+        echo "usage: scripts/setup.sh [--system [PACKAGE...] | --lerobot-main PATH]"
+        sed -n '2,4s/^# //p' scripts/setup.sh
+        exit 0
+        ;;
+    *)
+        say "unknown option $1: scripts/setup.sh --help"
+        exit 2
+        ;;
+esac
+
 install_system_packages() {
     command -v dpkg-query >/dev/null || {
         say "not Debian or Ubuntu: install OpenGL (EGL or OSMesa), FFmpeg, cmake and a C++ compiler yourself"

@@ -82,3 +82,17 @@ def test_setup_goes_on_where_the_file_system_has_no_locks(clone):
         assert setup.wait(PATIENCE_S) == 0
         assert "waiting" not in setup.stderr.read()
     assert (clone / "installs").read_text() == "begin\nend\n"
+
+
+def test_help_and_unknown_options_install_nothing(clone):
+    run = [clone / "scripts" / "setup.sh"]
+    told = subprocess.run([*run, "--help"], capture_output=True, text=True)
+    assert (told.returncode, told.stdout.startswith("usage: scripts/setup.sh")) == (0, True)
+    assert "Sets up everything" in told.stdout
+    refused = subprocess.run([*run, "--helo"], capture_output=True, text=True)
+    assert (refused.returncode, refused.stderr) == (
+        2,
+        "setup: unknown option --helo: scripts/setup.sh --help\n",
+    )
+    assert not (clone / "installs").exists()
+    assert not (clone / ".venv").exists()

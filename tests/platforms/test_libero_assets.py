@@ -11,6 +11,7 @@ import shutil
 import zipfile
 from pathlib import Path
 
+import httpx
 import pytest
 
 from lerobot_roborecover.platforms.libero import PLATFORM, assets
@@ -138,6 +139,14 @@ def test_init_states_run_no_code(tmp_path, monkeypatch):
     with pytest.raises(SimulatorError, match="not part of a numpy array"):
         init_states.read_init_states("libero_goal", "bad")
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_hub_that_does_not_answer_is_a_reason(tmp_path, monkeypatch):
+    def unreachable(*_, **__):
+        raise httpx.ConnectError("Name or service not known")
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", unreachable)
+    assert "failed (Name or service not known)" in assets._download(tmp_path)
 
 
 def test_a_download_names_its_commit(tmp_path, monkeypatch):

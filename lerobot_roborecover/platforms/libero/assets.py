@@ -228,12 +228,12 @@ def _own_config() -> TemporaryFolder:
 
 def _download(folder: Path) -> str:
     """Fetches the assets from the Hub; returns what went wrong, in words, or nothing."""
+    import httpx
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError
 
     try:
         snapshot_download(HUB_REPOSITORY, repo_type="dataset", revision=HUB_REVISION, local_dir=folder)
-    except (OSError, ValueError, HfHubHTTPError) as err:
+    except (OSError, ValueError, httpx.HTTPError) as err:  # the Hub's own errors are httpx's
         return (
             f"downloading {HUB_REPOSITORY} failed ({' '.join(str(err).split())[:200] or type(err).__name__})"
         )
