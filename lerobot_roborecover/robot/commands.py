@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
+import pkgutil
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from lerobot.robots import RobotConfig
 from lerobot.rollout.inference import InferenceEngineConfig, SyncInferenceConfig
 from lerobot.teleoperators import TeleoperatorConfig
 
-from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.robot.approach import MotionConfig
 from lerobot_roborecover.robot.connection import asking, connected
 from lerobot_roborecover.robot.console import Console
@@ -51,7 +53,8 @@ class RobotSession:
     keys: dict[str, str] = field(default_factory=dict)
     """Button by key of the terminal, beside the usual ones, e.g. `{b: mark}` for a pedal that types a b."""
     operator: str = ""
-    """`simulated` has the simulated lab put objects back and judge by itself; empty asks people."""
+    """`simulated` has the simulated lab answer everything by itself; empty asks people, and the lab has hands
+    alone."""
 
     def __post_init__(self) -> None:
         for name, values in self.limits.items():
@@ -156,18 +159,32 @@ def session(config: RobotSession) -> Generator[Session]:
                 PhoneConfig(config.console_host, config.console_port, config.tls_certificate, config.tls_key),
             )
             stack.callback(phone.close)
+            stack.enter_context(_last_words(console))
             listener = _keyboard(console, config.keys)
             if listener is not None:
                 stack.callback(listener.stop)
         yield Session(robot, console, teleop)
 
 
-def _operator(config: RobotSession, robot: Any) -> Any:
-    if not config.operator:
-        return None
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+@contextmanager
+def _last_words(console: Console) -> Generator[None]:
+    """Has the page say that the command is over, and why."""
+    try:
+        yield
+    except RoboRecoverError as err:
+        console.show("over", str(err))
+        raise
+    if console.state()["name"] != "over":
+        console.show("over", "Done. The terminal has the result.")
 
-    if not hasattr(robot, "world"):
+
+def _operator(config: RobotSession, robot: Any) -> Any:
+    from lerobot_roborecover.robot.lab.operator import SimulatedHands, SimulatedOperator
+
+    in_lab = hasattr(robot, "world")
+    if not config.operator:
+        return SimulatedHands(robot, seed=robot.config.seed) if in_lab else None
+    if not in_lab:
         raise OptionError(
             f"--operator=simulated: robot {robot.name} is real, and a person has to put its objects back. "
             "Leave the option out"
@@ -193,6 +210,20 @@ def _keyboard(console: Console, keys: Mapping[str, str]) -> Any:
     listener = TerminalKeyListener(pressed)
     listener.start()
     return listener
+
+
+def register_hardware() -> None:
+    """Makes LeRobot's own robots, cameras and teleoperators known by name, as its commands do; plugins are
+    known from elsewhere."""
+    import lerobot.cameras
+    import lerobot.robots
+    import lerobot.teleoperators
+
+    for package in (lerobot.robots, lerobot.cameras, lerobot.teleoperators):
+        for module in pkgutil.iter_modules(package.__path__):
+            if module.ispkg:
+                with suppress(ImportError):  # its type is not known then, and the parser says so
+                    importlib.import_module(f"{package.__name__}.{module.name}")
 
 
 def policy_arguments(argv: Sequence[str]) -> tuple[str, list[str], list[str]]:
@@ -254,6 +285,7 @@ def run_capture(argv: Sequence[str]) -> int:
         return 0
 
     command.__annotations__["config"] = CaptureConfig
+    register_hardware()
     return run_with_arguments(command, "roborecover robot capture", rest)
 
 
@@ -281,6 +313,7 @@ def run_restore(argv: Sequence[str]) -> int:
         return 1 if found.reason else 0
 
     command.__annotations__["config"] = RestoreConfig
+    register_hardware()
     return run_with_arguments(command, "roborecover robot restore", argv)
 
 
@@ -317,4 +350,5 @@ def run_plan(argv: Sequence[str]) -> int:
         return 0
 
     command.__annotations__["config"] = PlanRunConfig
+    register_hardware()
     return run_with_arguments(command, "roborecover robot run", argv)

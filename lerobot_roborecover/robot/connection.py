@@ -45,7 +45,7 @@ def connected(config: Any) -> Generator[Any]:
         cause = err.__cause__ or err  # LeRobot names the whole configuration, and then the reason
         if isinstance(cause, RoboRecoverError):
             raise cause from None
-        raise RobotError(f"--robot.type={config.type}: {_line(cause)}") from err
+        raise RobotError(f"--robot.type: {_line(cause)}") from err
     try:
         robot.connect()
     except (ConnectionError, OSError, RuntimeError, ValueError) as err:

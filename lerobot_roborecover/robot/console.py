@@ -122,6 +122,11 @@ class Console:
         self._stop.clear()
 
     @property
+    def phone_in(self) -> bool:
+        """Whether a phone is there."""
+        return self._heard is not None and not self.phone_gone
+
+    @property
     def phone_gone(self) -> bool:
         """Whether a phone was there and does not ask any more."""
         return self._heard is not None and self._seconds() - self._heard > PHONE_GONE_S

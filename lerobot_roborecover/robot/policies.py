@@ -45,7 +45,7 @@ def load_context(
     from lerobot.rollout.context import build_rollout_context
     from lerobot.rollout.inference import RTCInferenceConfig, SyncInferenceConfig
 
-    from lerobot_roborecover.policies.command_line import process_arguments
+    from lerobot_roborecover.policies.command_line import plain_output, process_arguments
     from lerobot_roborecover.robot.config_held_robot import HeldRobotConfig
 
     register_plugins()
@@ -56,7 +56,7 @@ def load_context(
         )
     renamed = dict(rename_map or {})
     try:
-        with process_arguments("roborecover robot", []):
+        with process_arguments("roborecover robot", []), plain_output():
             config = PreTrainedConfig.from_pretrained(path, cli_overrides=list(overrides))
             config.pretrained_path = path  # ty: ignore[invalid-assignment] - LeRobot sets text, too
             provided = {f"observation.images.{name}" for name in camera_names(robot)}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import sys
 
 import pytest
@@ -12,6 +14,7 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.robot.plan import lock_plan, parse_plan
 from lerobot_roborecover.robot.points import write_points
+from tests.support.doc_blocks import ROOT
 from tests.support.factories import save_policy
 from tests.support.robot_points import made_point, pictures_of
 
@@ -90,3 +93,26 @@ def test_a_pedal_is_a_key_of_the_terminal(monkeypatch, capsys):
     assert console.poll().button == "mark"
     assert console.poll() is None
     assert "b=mark" in capsys.readouterr().out
+
+
+def test_the_pages_options_of_an_so101_are_lerobots(tmp_path, capsys, monkeypatch):
+    import draccus
+
+    from lerobot_roborecover.robot.commands import CaptureConfig, register_hardware
+
+    page = (ROOT / "docs" / "robots.md").read_text()
+    (words,) = re.findall(r"ROBOT=\((.*?)\)\n", page, re.S)
+    options = shlex.split(words)
+    register_hardware()
+    config = draccus.parse(CaptureConfig, args=[*options, "--teleop.type=so101_leader", "--teleop.port=x"])
+    kinds = (type(config.robot).__name__, type(config.teleop).__name__)
+    assert kinds == ("SOFollowerRobotConfig", "SOLeaderTeleopConfig")
+    assert {name: camera.index_or_path for name, camera in config.robot.cameras.items()} == {
+        "top": 0,
+        "wrist": 2,
+    }
+    # Without the arm, or without its bus's package, that is one line.
+    monkeypatch.chdir(tmp_path)
+    write_points("points", [made_point("a")], {"a": pictures_of(0)})
+    line = refused(capsys, "restore", *options, "--points=points", "--robot.calibration_dir=calibration")
+    assert "--robot.type: 'feetech-servo-sdk' is required" in line or "cannot be connected" in line

@@ -18,7 +18,8 @@ from tests.support.browser import browsing
 
 
 @pytest.fixture
-def served():
+def served(monkeypatch):
+    monkeypatch.setattr("lerobot_roborecover.robot.phone.server._LAST_LOOK_S", 0.0)
     console, lines = Console(), []
     phone = Phone(console, PhoneConfig(port=0), lines.append)
     yield console, phone, lines
@@ -99,7 +100,8 @@ def test_a_taken_port_is_one_line(served):
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
-def test_a_certificate_makes_it_https(tmp_path):
+def test_a_certificate_makes_it_https(tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_roborecover.robot.phone.server._LAST_LOOK_S", 0.0)
     words = (
         "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=lab "
         "-addext subjectAltName=IP:127.0.0.1 -keyout key.pem -out certificate.pem"

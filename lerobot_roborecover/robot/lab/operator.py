@@ -107,3 +107,14 @@ class SimulatedOperator:
     def verdict(self) -> str:
         """What a person who looks at the table says: `success` or `failure`."""
         return "success" if self.robot.world.succeeded() else "failure"
+
+
+class SimulatedHands(SimulatedOperator):
+    """Clears the table and puts objects back when the page asks a person to, who presses every button."""
+
+    def answer(self, screen: str, details: dict[str, Any]) -> None:
+        """Does what the screen asks for; says nothing."""
+        if screen == "clear":
+            self.clear()
+        if screen == "place":
+            self.place(details["truth"])

@@ -13,6 +13,7 @@ import secrets
 import socket
 import ssl
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,8 @@ from lerobot_roborecover.web.serve import listen, make_server
 
 COOKIE = "roborecover_console"
 MAX_TRIES = 5
+_LAST_LOOK_S = 1.5
+"""The page asks twice a second."""
 VIEWS = ("blend", "difference", "edges", "recorded", "live")
 _PAGE = PageFiles("lerobot_roborecover.robot.phone", "app.js")
 
@@ -194,6 +197,7 @@ class Phone:
     """
 
     def __init__(self, console: Console, config: PhoneConfig, say: Callable[[str], None] = print):
+        self._console = console
         _check_pair(config.tls_certificate, config.tls_key)
         self._listener = listen(config.port, config.host)
         port = self._listener.getsockname()[1]
@@ -219,6 +223,9 @@ class Phone:
         self._thread.start()
 
     def close(self) -> None:
+        """Ends the server, once a phone that is in has seen the last screen."""
+        if self._console.phone_in:
+            time.sleep(_LAST_LOOK_S)
         self._server.should_exit = True
         self._thread.join(5.0)
         self._listener.close()

@@ -10,6 +10,7 @@ const WORDS = {
 let view = "blend";
 let shown = -1;
 let inside = false;
+let away = false;
 
 async function send(path, body) {
   const answer = await fetch(`api/${path}`, {
@@ -103,13 +104,21 @@ async function look() {
       const answer = await fetch("api/state");
       const state = await answer.json();
       if (!answer.ok) throw new Error(state.error);
-      byId("text").textContent = state.stopped ? "STOPPED" : state.details.notice || state.text;
+      const text = state.details.notice || state.text;
+      byId("text").textContent = state.stopped ? `STOPPED. ${state.buttons.length ? text : ""}` : text;
       if (state.version !== shown) showScreen(state);
       shown = state.version;
       showPictures(state);
+      if (away) complain(null);
+      away = false;
+      if (state.name === "over") { // the server ends with the command
+        byId("stop").hidden = byId("leave").hidden = true;
+        return;
+      }
     } catch (error) {
-      complain(error);
-      if (!(error instanceof TypeError)) inside = false; // a TypeError is a network that is away
+      away = error instanceof TypeError; // the network's; the server's own are errors
+      complain(away ? new Error("The robot's computer does not answer. STOP does not work: look at its terminal.") : error);
+      if (!away) inside = false;
     }
   } else {
     byId("text").textContent = "RoboRecover: console of the robot";
