@@ -41,8 +41,8 @@ def analyse(study: Study, options: Options | None = None) -> Results:
             or "none but interventions"
         )
         raise RowsError(
-            f"no trials of direct control from recovery points (there are: {what}). Run lerobot-eval without "
-            "--env.start, or name the direct one with --baseline"
+            f"no trials from recovery points by a policy without an intervention (there are: {what}). Give "
+            "the log of a run with --env.start=recovery, the default, too; or name the policy with --baseline"
         )
     remarks = list(study.remarks)
     chosen, pairs = _pair(direct, [*acting, *study.of(Start.REVERSION)], options, remarks)

@@ -25,6 +25,7 @@ from lerobot_roborecover.datasets.files import finish_update
 from lerobot_roborecover.datasets.read import read_with_manifest
 from lerobot_roborecover.datasets.schema import FOLDER, MANIFEST_FILE
 from lerobot_roborecover.scenario import Scenario, ScenarioError
+from lerobot_roborecover.utils.text import nearest
 
 __all__ = ["ScenarioSet", "builtin_names", "load_scenarios", "validate_for"]
 
@@ -196,9 +197,11 @@ def _locate(source: str | os.PathLike[str], revision: str | None) -> tuple[Path,
 
         return pull(text, revision)
     else:
+        near = nearest(text, builtin)
+        hint = f"the nearest is {near}; " if near else ""
         raise ScenarioError(
-            f"scenarios {text[:200]!r} is neither a folder, nor a built-in set (there are {builtin}), nor a "
-            "Hub dataset id like org/name. Check the spelling, or the path from the current directory"
+            f"scenarios {text[:200]!r} is neither a folder, nor a built-in set ({hint}there are {builtin}), "
+            "nor a Hub dataset id like org/name. Check the spelling, or the path from the current directory"
         )
     if revision:
         raise ScenarioError(

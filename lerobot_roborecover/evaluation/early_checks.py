@@ -247,16 +247,13 @@ class CommandLine:
             head += f"{part}."
 
     def _refuse_name(self, name: str, head: str, part: str, names: set[str]) -> None:
-        """Refuses a name; LeRobot's parser takes the beginning of one, where it is of one alone."""
+        """Refuses a name that is no option; LeRobot's parser takes no beginning of one, either."""
         begun = sorted(one for one in names if one.startswith(part))
-        last = f"{head}{part}" == name
-        if last and len(begun) == 1:
-            return
-        if last and begun:
+        if f"{head}{part}" == name and len(begun) > 1:
             raise OptionError(
                 f"--{name:.80} can be {', '.join(f'--{head}{one}' for one in begun[:5])}: write it out"
             )
-        near = nearest(part, [*names, *(() if head else self.source.short or ())])
+        near = begun[0] if begun else nearest(part, [*names, *(() if head else self.source.short or ())])
         rest = name.removeprefix(f"{head}{part}")
         hint = (
             f"the nearest is --{head}{near}{rest}" if near else f'"{self.source.program} --help" lists them'

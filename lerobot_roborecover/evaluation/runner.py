@@ -288,11 +288,22 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
 
 
 def _say_next(cfg: RecoveryEvalConfig, log: Path) -> int:
-    """Names the command that reports a finished run; not for a shard, or an arm of another command."""
+    """Names the command that reports a finished run, and how to add the other start; not for a shard, or
+    where another command runs this one."""
     out, (_, shards) = cfg.folder, cfg.recovery_env.shard_of()
     if NESTED not in os.environ and shards == 1:
-        logged = out if log == out / "trials.jsonl" else log
-        print(next_command(["report", str(logged), "--out", str(out / "report")]))
+        logged = str(out if log == out / "trials.jsonl" else log)
+        start = Start(cfg.recovery_env.start)
+        if start is Start.INITIAL:
+            logged = f"RECOVERY_RUN,{logged}"
+        print(next_command(["report", logged, "--out", str(out / "report")]))
+        if start is Start.INITIAL:
+            print("RECOVERY_RUN is the --output_dir of the same command with --env.start=recovery")
+        elif start is Start.RECOVERY:
+            print(
+                f"with its rate from initial states: the same command with --env.start=initial and another "
+                f"--output_dir, OTHER; then report {logged},OTHER"
+            )
     return 0
 
 

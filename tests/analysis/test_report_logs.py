@@ -73,7 +73,7 @@ REFUSALS = {
     ),
     "starts": (
         [trial_row(0, start="initial")],
-        "no trials of direct control from recovery points (there are: initial)",
+        "no trials from recovery points by a policy without an intervention (there are: initial)",
     ),
 }
 

@@ -35,6 +35,7 @@ REFUSALS = [
     (["eval", *SOUND, "--policy.n_actoin_steps=5"], "the nearest is --policy.n_action_steps"),
     (["eval", *SOUND, "--runner.slot_count=5"], "there is no option --runner.slot_count"),
     (["eval", *SOUND, "--shrd=0/2"], "no option --shrd; the nearest is --shard"),
+    (["eval", *SOUND, "--env.scenario=x"], "no option --env.scenario; the nearest is --env.scenarios"),
     (["eval", *SOUND, "--env.s=x"], "--env.s can be --env.scenarios, --env.select"),
     (["eval", *SOUND, "--shard=4/2"], "--env.shard=4/2: must be k/n"),
     (["eval", *SOUND, "--env.start=recover"], "--env.start=recover: not one of ['recovery'"),

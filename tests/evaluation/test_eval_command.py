@@ -98,7 +98,8 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert "Recovery success (RSR)" in shown
     named = f"next: roborecover report {out} --out {out / 'report'}"
-    assert shown.splitlines()[-1] == named
+    assert shown.splitlines()[-2] == named
+    assert "the same command with --env.start=initial" in shown.splitlines()[-1]
     assert "Loading weights" not in shown
     monkeypatch.setenv(NESTED, "1")
     run()
