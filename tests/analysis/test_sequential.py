@@ -112,6 +112,7 @@ def test_a_rerun_of_a_decided_comparison_runs_nothing(stopped, dataset):
     assert again == rows
 
 
+@pytest.mark.slow
 def test_the_line_shows_what_holds_at_any_time(stopped, dataset, tmp_path):
     watch, rows = evaluate(dataset, tmp_path / "trials.jsonl", "push@1", PushHost(), ALONE)
     assert len(rows) == COUNT * TRIALS
@@ -155,6 +156,7 @@ def test_what_cannot_be_compared_is_refused(stopped, dataset, tmp_path):
         evaluate(dataset, tmp_path / "c.jsonl", "b@1", LazyHost(), str(write_log(tmp_path / "two", rows)))
 
 
+@pytest.mark.slow
 def test_a_report_knows_a_run_that_stopped(stopped, dataset, tmp_path):
     root, _, _ = stopped
     evaluate(dataset, tmp_path / "third" / "trials.jsonl", "third@1", PushHost())

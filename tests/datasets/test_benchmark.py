@@ -54,6 +54,7 @@ def metadata_of(files: dict[str, bytes]) -> dict:
     return yaml.safe_load(files["README.md"].decode().split("---\n")[1])
 
 
+@pytest.mark.slow
 def test_the_benchmark_and_its_splits(hub, client, local):
     files = published(hub, client, local, "--title", "Our set")
     about = yaml.safe_load(files["eval.yaml"])
@@ -79,6 +80,7 @@ def test_names_of_splits_stay_apart():
     assert split_names(scenarios) == {"a-b": "a_b", "a_b": "a_b_", "c.d": "c_d"}
 
 
+@pytest.mark.slow
 def test_an_owner_s_benchmark_stays_and_tables_of_splits_that_are_gone_leave(hub, client, local, tmp_path):
     published(hub, client, local)
     client.roborecover("pull", REPO, "--out", tmp_path / "pulled")

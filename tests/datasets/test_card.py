@@ -21,6 +21,7 @@ def local(tmp_path):
     return fake_dataset(tmp_path / "local", 6)
 
 
+@pytest.mark.slow
 def test_the_card_says_what_is_there_and_its_metadata_is_valid(hub, client, local):
     from huggingface_hub import DatasetCardData
 
@@ -62,6 +63,7 @@ def test_a_licence_is_asked_for_and_never_invented(hub, client, local):
     assert not hub.log
 
 
+@pytest.mark.slow
 def test_frames_of_the_fingerprint_make_the_grid_of_the_card(hub, client, tmp_path):
     buffer = io.BytesIO()
     Image.new("RGB", (32, 32), (200, 30, 30)).save(buffer, "PNG")

@@ -64,6 +64,7 @@ def publish(hub, root: Path, **settings) -> str:
     return hub.repos[REPO].commit(files)
 
 
+@pytest.mark.slow
 def test_push_then_load_at_tag_and_commit_pulls_only_scenarios_and_certificate(hub, client, local):
     (local / FOLDER / "certificate.json").write_text("{}")
     pushed = client.run(PUSH, REPO, str(local), token=TOKEN)
@@ -95,6 +96,7 @@ def test_without_a_revision_the_commit_to_pin_is_logged(hub, client, local):
     assert "LOG" not in pinned.stderr
 
 
+@pytest.mark.slow
 def test_a_moved_branch_is_followed_but_a_pinned_commit_stays(hub, client, local, tmp_path):
     first = publish(hub, local)
     assert len(loaded(client.run(LOAD, REPO, "main"))["ids"]) == 3
@@ -105,6 +107,7 @@ def test_a_moved_branch_is_followed_but_a_pinned_commit_stays(hub, client, local
     assert len(loaded(client.run(LOAD, REPO, first))["ids"]) == 3
 
 
+@pytest.mark.slow
 def test_a_pinned_commit_in_the_cache_needs_no_network(hub, client, local):
     commit = publish(hub, local)
     loaded(client.run(LOAD, REPO, commit))
@@ -153,6 +156,7 @@ def test_a_dataset_without_scenarios_is_named_as_such(hub, client):
     assert "not a scenario dataset" in loaded(client.run(LOAD, REPO, ""))["error"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_pull_cut_half_way_never_loads_and_a_later_one_does(hub, client, local):
     commit = publish(hub, local)

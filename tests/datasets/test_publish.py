@@ -22,6 +22,7 @@ def local(tmp_path):
     return fake_dataset(tmp_path / "local", 6)
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_everything_and_changes_nothing(hub, client, local):
     done = client.publish(local, "--dry-run", "--private")
     for piece in (
@@ -36,6 +37,7 @@ def test_a_dry_run_says_everything_and_changes_nothing(hub, client, local):
     assert all(method == "GET" for method, _ in hub.log)
 
 
+@pytest.mark.slow
 def test_a_private_repository_is_made_private(hub, client, local, tmp_path):
     client.publish(local, "--private")
     assert hub.repos[REPO].private
@@ -63,6 +65,7 @@ def test_a_published_version_stays_unless_forced(hub, client, local, tmp_path):
     assert hub.repos[REPO].refs["roborecover-1.0.0"] == first
 
 
+@pytest.mark.slow
 def test_files_that_are_gone_leave_and_an_owner_s_card_stays(hub, client, local):
     (local / "data").mkdir()
     (local / "LICENSE").write_text("terms")
@@ -76,6 +79,7 @@ def test_files_that_are_gone_leave_and_an_owner_s_card_stays(hub, client, local)
     assert b"my own words" in files["README.md"]
 
 
+@pytest.mark.slow
 def test_a_dropped_upload_is_resumed_without_sending_again_what_arrived(hub, client, local):
     add_episodes(local, 3)
     scenarios = (local / "meta/roborecover/scenarios.parquet").read_bytes()
@@ -107,6 +111,7 @@ FAILURES = [
 """Each request that may fail, in each way; by default one way of each."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "pattern", "status"), FAILURES)
 def test_what_fails_twice_and_then_works_is_published(hub, client, local, method, pattern, status):
     hub.failures.append([method, pattern, status, 2])
@@ -115,6 +120,7 @@ def test_what_fails_twice_and_then_works_is_published(hub, client, local, method
     assert hub.repos[REPO].refs["roborecover-1.0.0"] == commit_of(done)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("failure", "words"),
     [
@@ -218,6 +224,7 @@ def test_a_publication_that_is_killed_shows_nothing_half_and_goes_on(hub, client
     assert not sent & arrived, "what had arrived was sent again"
 
 
+@pytest.mark.slow
 def test_a_large_file_goes_in_parts_and_a_part_that_is_cut_goes_again(hub, client, local):
     add_episodes(local, 1, size=2**17)
     name = "data/chunk-000/file-000.parquet"

@@ -27,6 +27,7 @@ def put(hub, root: Path, **extra: bytes) -> None:
     hub.repos[REPO].commit({**files_of(root), **extra})
 
 
+@pytest.mark.slow
 def test_a_pull_that_is_cut_leaves_nothing_and_a_later_one_completes(hub, client, local, tmp_path):
     put(hub, local)
     hub.cut.add("meta/roborecover/scenarios.parquet")
@@ -105,6 +106,7 @@ def test_a_pull_survives_what_passes_by_itself(hub, client, local, tmp_path, fai
     assert files_of(tmp_path / "out") == files_of(local)
 
 
+@pytest.mark.slow
 def test_publish_then_pull_at_the_printed_revision_is_bit_identical(hub, client, local, tmp_path):
     commit = commit_of(client.publish(local))
     assert hub.repos[REPO].refs == {"main": commit, "roborecover-1.0.0": commit}
@@ -117,6 +119,7 @@ def test_publish_then_pull_at_the_printed_revision_is_bit_identical(hub, client,
         assert {k: v for k, v in files_of(out).items() if k.startswith("meta/")} == files_of(local)
 
 
+@pytest.mark.slow
 def test_an_evaluation_from_the_hub_is_bit_identical_to_one_from_the_folder(hub, client, local, tmp_path):
     commit = commit_of(client.publish(local))
     script = """

@@ -76,6 +76,7 @@ def rows(text):
     return [tuple(cell.strip() for cell in line.strip("|").split(" | ")) for line in lines]
 
 
+@pytest.mark.slow
 def test_the_task_table_counts_the_scenarios():
     counted = defaultdict(set)
     for name in ("libero_recovery", "metaworld_recovery"):

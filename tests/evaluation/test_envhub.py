@@ -42,6 +42,7 @@ print(json.dumps({"envs": steps}))
 
 @pytest.mark.lerobot
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_lerobot_makes_the_environment_of_a_repository_on_the_hub(hub, client, tmp_path):
     commit = commit_of(client.publish(fake_dataset(tmp_path / "local", 6)))
     out = tmp_path / "env"

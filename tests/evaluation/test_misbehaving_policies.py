@@ -131,6 +131,7 @@ def test_a_bad_answer_becomes_policy_errors_in_lerobots_loop(dataset, tmp_path, 
     assert len(rows) == COUNT * TRIALS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i4", "i8", "u1"])
 def test_real_numbers_of_any_size_are_executed(dataset, tmp_path, dtype):
     host = BadHost(lambda chunks: [np.clip(c, 0, 1).astype(dtype) for c in chunks])
@@ -138,6 +139,7 @@ def test_real_numbers_of_any_size_are_executed(dataset, tmp_path, dtype):
     assert {r.outcome for r in rows} <= {"success", "horizon"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_policy_that_blocks_ends_its_trials_and_the_run(dataset, tmp_path):
     host = BlockingHost(good=5)
@@ -248,7 +250,8 @@ HUNG_LOOP = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stubborn", [False, pytest.param(True, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("stubborn", [False, True])
 def test_lerobots_loop_ends_where_the_policy_blocks(dataset, tmp_path, stubborn):
     program = textwrap.dedent(HUNG_LOOP).replace("{stubborn}", str(stubborn))
     log = tmp_path / "log.jsonl"

@@ -210,6 +210,7 @@ def test_an_action_that_is_none_is_refused(toys, action):
         simulator.step(action)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "says"), [("Clock", "observation.clock"), ("Unseeded", "agent_pos")])
 def test_the_conformance_suite_names_what_differs(toys, monkeypatch, name, says):
     platform = platform_named("lerobot_pusht")  # whichever: its simulator is replaced

@@ -90,9 +90,8 @@ def test_every_task_has_code_and_an_official_limit(simulator):
     assert {t for t in STEP_LIMITS if not simulator.checkout.missing_objects(t)} >= set(TASKS)
 
 
-@pytest.mark.parametrize(
-    "name", [n if n == TASKS[0] else pytest.param(n, marks=pytest.mark.nightly) for n in TASKS]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", TASKS)
 def test_replays_are_bit_identical_in_this_process_and_in_a_fresh_one(simulator, name, tmp_path):
     steps = 200 if REAL else 40
     task, other = task_of(name), task_of(TASKS[1] if name == TASKS[0] else TASKS[0])

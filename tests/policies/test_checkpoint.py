@@ -191,6 +191,7 @@ def test_every_command_says_it_in_one_line(command, name, broken, scenarios, tmp
     assert WORDS[name] in last
 
 
+@pytest.mark.slow
 def test_eval_refuses_a_wrong_folder_before_lerobot_is_imported():
     program = (
         "import sys; from lerobot_roborecover.cli.main import main; "

@@ -322,6 +322,7 @@ def cosmos(monkeypatch, seen):
     return ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "module", "family", "steps"),
     [

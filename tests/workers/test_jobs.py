@@ -78,6 +78,7 @@ def test_what_goes_wrong_is_that_jobs_own_affair():
             pool.call(work, "dies")
 
 
+@pytest.mark.slow
 def test_one_process_and_one_simulator_from_job_to_job():
     with JobPool("fake", workers=1) as pool:
         first, second = (pool.call(work, "simulator") for _ in range(2))
