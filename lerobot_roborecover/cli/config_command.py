@@ -40,7 +40,6 @@ _POLICY_PATH = (
 _LEROBOTS = {
     **LEROBOT_OPTIONS,
     "device": "Where the policy runs: `cuda`, `cuda:0`, `mps` or `cpu`; else as the checkpoint says.",
-    "eval.n_episodes": "Trials of each scenario.",
     "output_dir": "Folder of the trial log, the results and the videos; a new one by default.",
     "job_name": "Part of the name of that new folder.",
     "seed": "Of the run: trial k of a scenario draws its noise from it, the scenario and k.",
@@ -112,6 +111,7 @@ EVAL = ConfigCommand(
         short=ALIASES,
     ),
     f"{_PACKAGE}.evaluation.runner:main",
+    CommandLine.check_action_widths,
     # Read when torch is loaded: threads of a policy on the CPU that spin while they wait for each other take
     # the cores from the simulators. It changes no number.
     environment={"OMP_WAIT_POLICY": "PASSIVE"},

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +49,7 @@ def summary(found: ScenarioSet) -> str:
         f"{found.manifest.get('license') or 'not given'}",
         f"prefixes {lengths.min()} to {lengths.max()} actions, median {np.median(lengths):g}, mean "
         f"{lengths.mean():.1f}",
+        f"time limits after the recovery point: {_time_limits(scenarios)} steps",
         f"{sum(s.fingerprint is not None for s in scenarios)} with a handoff fingerprint",
     ]
     if found.root is not None:
@@ -71,12 +72,30 @@ def summary(found: ScenarioSet) -> str:
             for v in values
         ]
         lines += ["", *align([[label, *splits, "all"], *rows])]
+    tasks = defaultdict(list)
+    for scenario in scenarios:
+        tasks[scenario.task.suite, scenario.task.name].append(scenario)
+    rows = [
+        [
+            name[:72],
+            *(sum(s.split == split for s in group) for split in splits),
+            len(group),
+            _time_limits(group),
+        ]
+        for (_, name), group in sorted(tasks.items())
+    ]
+    lines += ["", *align([["task", *splits, "all", "time limit"], *rows])]
     counts = Counter((s.stage, s.deviation) for s in scenarios)
     rows = [[stage.value, *(counts[stage, kind] or "-" for kind in DeviationType)] for stage in Stage]
     lines += ["", *align([["stage", *(kind.value for kind in DeviationType)], *rows])]
     versions = _in_short(package_versions(scenarios))
     lines += ["", *(f"{name} {', '.join(values)}" for name, values in versions.items())]
     return "\n".join(lines)
+
+
+def _time_limits(scenarios: Iterable[Scenario]) -> str:
+    limits = sorted({s.task.horizon for s in scenarios})
+    return f"{limits[0]}" if len(limits) == 1 else f"{limits[0]} to {limits[-1]}"
 
 
 def _in_short[V](versions: Mapping[str, V]) -> dict[str, V]:

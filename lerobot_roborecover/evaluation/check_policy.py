@@ -45,6 +45,7 @@ from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.policies.runner import Act, PolicyError, PolicyRunner, WatchedHost, decision_of
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.capacity import available_gb, default_slots, usable_cores
 from lerobot_roborecover.workers.messages import EpisodeStart
 
@@ -148,7 +149,7 @@ def _open(cfg: CheckPolicyConfig) -> tuple[ScenarioSet, EvalSession]:
     facts = policy_metadata(cfg.policy, rename_map=cfg.rename_map, n_episodes=cfg.eval.n_episodes)
     options = copy(cfg.recovery_env)
     options.trial_log = log
-    scenarios, run = create_session(options, options.run_spec(), workers=True, facts=facts)
+    scenarios, run = create_session(options, options.run_spec(), workers=True, facts=facts, announce=False)
     run.pool.on_close(folder.close)
     return scenarios, run
 
@@ -290,9 +291,10 @@ def _estimate(
         ok("inference time", value),
         ok(
             "run time",
-            f"at most {_time(total)} on {slots} slots for {len(scenarios)} scenarios x {cfg.eval.n_episodes} "
-            f"trials ({_time(policy_s)} of the policy, {_time(sim_s)} of the simulators; {busy} will be the "
-            f"slower), if every trial ran to its last step. From {len(steps.actions)} steps on this machine",
+            f"at most {_time(total)} beside LeRobot's own start on {slots} slots for {len(scenarios)} "
+            f"scenarios x {pluralize(cfg.eval.n_episodes, 'trial')} from one start ({_time(policy_s)} of the "
+            f"policy, {_time(sim_s)} of the simulators; {busy} will be the slower), if every trial ran to "
+            f"its last step. From {len(steps.actions)} steps on this machine",
         ),
     ]
 

@@ -20,7 +20,12 @@ from lerobot_roborecover.platforms.registry import (
     platform_names,
     platform_of,
 )
-from lerobot_roborecover.policies.checkpoint import check_checkpoint, nearest_path
+from lerobot_roborecover.policies.checkpoint import (
+    check_checkpoint,
+    is_other_width,
+    nearest_path,
+    other_width_problem,
+)
 from lerobot_roborecover.utils.config_source import (
     SourceClass,
     nested_class,
@@ -95,6 +100,7 @@ class CommandLine:
         self.given: dict[str, str] = {}
         """Text of each option of the command line, by its long name."""
         self._typed: list[str] = []
+        self._checkpoints: dict[str, Mapping[str, Any]] = {}
         short = source.short or {}
         for word in words:
             name, _, value = word.removeprefix("--").partition("=")
@@ -193,7 +199,9 @@ class CommandLine:
             OptionError: it cannot be loaded.
         """
         if path := self.value("policy.path"):
-            self._policy_type = str(check_checkpoint(path).get("type", ""))
+            config = check_checkpoint(path)
+            self._policy_type = str(config.get("type", ""))
+            self._checkpoints[f"--policy.path={path}"] = config
 
     def _check_policy(self) -> None:
         path, kind = self.value("policy.path"), self._policy_type
@@ -213,7 +221,27 @@ class CommandLine:
             part = self.value(f"policy.{member}.path")
             if part and not path:
                 revision = self.value(f"policy.{member}.revision") or None
-                check_checkpoint(part, f"--policy.{member}.path={part}", revision)
+                label = f"--policy.{member}.path={part}"
+                self._checkpoints[label] = check_checkpoint(part, label, revision)
+
+    def check_action_widths(self) -> None:
+        """Refuses checkpoints whose actions the platform does not take; after `check`.
+
+        Raises:
+            OptionError: naming the checkpoint, and both widths.
+        """
+        name = platform_of(self.env_type)
+        if self.env_type == WRAPPED or name not in platform_names() or platform_named(name).env_name:
+            return
+        widths = platform_named(name).action_widths
+        for label, config in self._checkpoints.items():
+            found: Any = config
+            for part in ("output_features", "action", "shape"):
+                found = found.get(part) if isinstance(found, Mapping) else None
+            own = found[0] if isinstance(found, list) and len(found) == 1 else None
+            padded = config.get("max_action_dim")
+            if isinstance(own, int) and is_other_width(str(config["type"]), own, padded, widths):
+                raise OptionError(other_width_problem(label, own, self.env_type, widths))
 
     # --- options
 

@@ -17,7 +17,7 @@ from lerobot_roborecover.evaluation.check_names import input_remedy
 from lerobot_roborecover.evaluation.early_checks import check_policy_options
 from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 from lerobot_roborecover.evaluation.lerobot_introspection import env_processors
-from lerobot_roborecover.policies.checkpoint import check_checkpoint
+from lerobot_roborecover.policies.checkpoint import check_checkpoint, other_width_problem
 from lerobot_roborecover.policies.command_line import only_meaningful_messages, plain_parsing
 from lerobot_roborecover.policies.determinism import fit_threads, make_cross_cpu_deterministic
 from lerobot_roborecover.policies.load_problems import other_action_width, plain_loading
@@ -83,10 +83,7 @@ def load_host(spec: HostSpec) -> PolicyRunner:
     width = spec.env.features["action"].shape[0]
     other = other_action_width(spec.policy, width)
     if other is not None:
-        raise OptionError(
-            f"--policy.path={spec.policy.pretrained_path}: its actions have {other} values, {spec.env.type} "
-            f"takes {width}. The checkpoint is for another robot or another kind of action"
-        )
+        raise OptionError(other_width_problem(f"--policy.path={path}", other, spec.env.type, (width,)))
     with plain_loading(f"--policy.path={path}", lambda: remedy_of(spec)):
         return _load_host(spec)
 

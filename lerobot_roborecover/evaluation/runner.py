@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import EvalConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.utils.utils import init_logging
 
@@ -119,9 +120,18 @@ class RunnerOptions:
 
 
 @dataclass
-class RecoveryEvalConfig(EvalPipelineConfig):
-    """LeRobot's evaluation config, plus the runner's options. `eval.batch_size` is not used."""
+class TrialsConfig(EvalConfig):
+    """LeRobot's options of `--eval.*`. Of them only `n_episodes` is used."""
 
+    n_episodes: int = 5
+    """Trials of each scenario, as in the paper. `lerobot-eval` takes LeRobot's 50."""
+
+
+@dataclass
+class RecoveryEvalConfig(EvalPipelineConfig):
+    """LeRobot's evaluation config, plus the runner's options."""
+
+    eval: TrialsConfig = field(default_factory=TrialsConfig)  # ty: ignore[incompatible-mutable-override]
     runner: RunnerOptions = field(default_factory=RunnerOptions)
 
     def __post_init__(self) -> None:

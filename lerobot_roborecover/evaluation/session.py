@@ -35,6 +35,7 @@ from lerobot_roborecover.policies.interventions.options import InterventionFacts
 from lerobot_roborecover.policies.metadata import PolicyMetadata
 from lerobot_roborecover.scenario import Scenario, Start, TrialStart
 from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.utils.text import pluralize
 from lerobot_roborecover.workers.messages import SlotConfig
 from lerobot_roborecover.workers.slots import SlotPool
 
@@ -172,6 +173,7 @@ def create_session(
     facts: PolicyMetadata | None = None,
     scenarios: ScenarioSet | None = None,
     run_seed: int | None = None,
+    announce: bool = True,
 ) -> tuple[ScenarioSet, EvalSession]:
     """Checks everything, loads the scenarios and opens the trial log; no simulator starts yet.
 
@@ -182,6 +184,7 @@ def create_session(
         facts: who is evaluated, and how much of it.
         scenarios: what to run in place of those that the options name.
         run_seed: seed of the run; None where the caller sets one later, or has none.
+        announce: log what will be run, and where its trials are recorded.
 
     Raises:
         OptionError: an option, or the batch size, cannot be used.
@@ -217,12 +220,13 @@ def create_session(
         versions=row_versions(platform),
     )
     log = TrialLog(options.trial_log_path(facts.output_dir))
-    trials = "" if facts.n_episodes is None else f", {facts.n_episodes} trials each"
-    logger.info(
-        "RoboRecover: %d scenarios of %s%s%s from %s; trial log %s (%d rows already there)",
-        len(scenarios), scenarios.source, _all_splits(scenarios, options), trials, start.value, log.path,
-        len(log),
-    )  # fmt: skip
+    if announce:
+        trials = "" if facts.n_episodes is None else f", {pluralize(facts.n_episodes, 'trial')} each"
+        logger.info(
+            "RoboRecover: %s of %s%s%s from %s; trial log %s (%s already there)",
+            pluralize(len(scenarios), "scenario"), scenarios.source, _all_splits(scenarios, options), trials,
+            start.value, log.path, pluralize(len(log), "row"),
+        )  # fmt: skip
     for remark in log.other_rows(protocol):
         logger.warning("%s", remark)
     if log.dropped_bytes:

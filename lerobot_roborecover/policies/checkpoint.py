@@ -41,6 +41,26 @@ def check_checkpoint(path: str | Path, label: str = "", revision: str | None = N
     return read_config(_hub_config(str(path), label, revision), label)
 
 
+def is_other_width(kind: str, own: int, padded: int | None, widths: Sequence[int]) -> bool:
+    """Whether actions of a checkpoint are of another robot than the environment's.
+
+    Args:
+        kind: type of the policy.
+        own: values in its actions.
+        padded: values that it pads them to, where it does.
+        widths: values that the environment takes.
+    """
+    return kind != "xvla" and own not in (*widths, padded)  # X-VLA's 20 values are converted
+
+
+def other_width_problem(label: str, own: int, env_type: str, widths: Sequence[int]) -> str:
+    """What to say of a checkpoint of another robot; arguments as above."""
+    return (
+        f"{label}: its actions have {own} values, {env_type} takes {' or '.join(map(str, widths))}. The "
+        "checkpoint is for another robot or another kind of action"
+    )
+
+
 def check_folder(folder: Path, label: str) -> dict[str, Any]:
     """Checks a checkpoint's folder: see `check_checkpoint`."""
     if not (folder / CONFIG_FILE).is_file():

@@ -9,6 +9,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
+from lerobot_roborecover.policies.checkpoint import is_other_width
 from lerobot_roborecover.policies.command_line import plain_output
 
 
@@ -84,7 +85,8 @@ def other_action_width(config: PreTrainedConfig, width: int) -> int | None:
         width: the env's.
     """
     feature = (getattr(config, "output_features", None) or {}).get(ACTION)
-    if feature is None or getattr(config, "type", "") == "xvla":  # X-VLA's 20 values are converted
+    if feature is None:
         return None
     own = int(feature.shape[0])
-    return None if own in (width, getattr(config, "max_action_dim", width)) else own
+    padded = getattr(config, "max_action_dim", None)
+    return own if is_other_width(getattr(config, "type", ""), own, padded, (width,)) else None

@@ -45,6 +45,7 @@ REFUSALS = [
     (["eval", *SOUND, "--policy.type=act"], "a checkpoint has a type; leave one out"),
     (["eval", *SOUND, "stray", "words"], "'stray' belongs to no option"),
     (["eval", *SOUND[:2], "--policy.path", f"{POLICY}s"], f"the nearest is {POLICY}"),
+    (["eval", "--env=roborecover_libero", SOUND[2]], "have 4 values, roborecover_libero takes 7"),
     (["eval", *SOUND[:2], "--policy.path="], "no policy: give a checkpoint"),
     (["eval", *SOUND[:2], "--policy.path=user/with a space"], "no Hub id (USER/NAME)"),
     (["eval", *SOUND[:2], "--policy.path=user//name"], "no Hub id (USER/NAME)"),
