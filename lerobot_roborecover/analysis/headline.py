@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.stats.contrasts import Contrast
 from lerobot_roborecover.analysis.stats.intervals import Estimate
@@ -68,8 +69,10 @@ def headline_of(results: Results) -> Headline:
             "Its rate is biased, and no verdict rests on it: its trial counts go with its outcomes. Evaluate "
             "every scenario the same number of times."
         )
+    initial = initial_estimates(results)[results.compared.policies[best]].value
+    first = "" if math.isnan(initial) else f"from initial states in {100 * initial:.1f} % and "
     claim = (
-        f"{name} recovers in {100 * rate.value:.1f} % of its trials, averaged over scenarios"
+        f"{name} succeeds {first}from recovery points in {100 * rate.value:.1f} % of trials"
         f"{_intervals(results, best, rate)}."
     )
     rivals = [results.ranked.arms[p] for p in valid[1:]]
@@ -99,7 +102,7 @@ def _intervals(results: Results, best: int, rate: Estimate) -> str:
         draws = results.tasks.part(np.array(results.compared.scenarios, int))
         (tasks,) = draws.rates(results.ranked.rates[[best]].T)
         if not math.isnan(tasks.low):
-            text += f"; {_bounds(tasks)} for other tasks like these {draws.units}"
+            text += f"; for other tasks like these {draws.units}: {_bounds(tasks)}"
     return text + ")"
 
 

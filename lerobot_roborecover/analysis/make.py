@@ -17,6 +17,7 @@ from lerobot_roborecover.analysis.options import Gallery, Options
 from lerobot_roborecover.analysis.pages.gallery import check_scenarios
 from lerobot_roborecover.analysis.pages.media import find_clips, videos_beside
 from lerobot_roborecover.analysis.pages.report import REPORT_FILES, Extras, ReportFiles, write_report
+from lerobot_roborecover.analysis.policy_tables import in_short
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.utils.outputs import check_page
@@ -35,7 +36,7 @@ class Report:
 
     def text(self) -> str:
         """Its headline, the table of all policies, and where the files are."""
-        overall = to_text(next(table for table in self.files.tables if table.name == "overall"))
+        overall = to_text(in_short(next(table for table in self.files.tables if table.name == "overall")))
         out = self.files.html.parent
         return (
             f"{headline(self.results)}\n\n{overall}\n\nreport    {self.files.html}\nmarkdown  "

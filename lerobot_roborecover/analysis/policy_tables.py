@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.results import Results
@@ -21,6 +22,9 @@ from lerobot_roborecover.analysis.stats.soundness import valid_trials
 from lerobot_roborecover.analysis.stats.units import ESTIMAND, ResamplingUnit
 from lerobot_roborecover.analysis.tables import Cell, Column, Table
 from lerobot_roborecover.scenario import Outcome, Start
+
+_DEFINITIONS = 2
+"""Notes of the overall table that define its numbers."""
 
 
 def overall(results: Results) -> Table:
@@ -73,6 +77,13 @@ def overall(results: Results) -> Table:
         *cells.notes(results.unit),
     )
     return Table("overall", "Overall results", columns, tuple(rows), notes)
+
+
+def in_short(table: Table) -> Table:
+    """The overall table as a terminal shows it: up to the invalid trials, without definitions."""
+    width = [column.title for column in table.columns].index("Invalid") + 1
+    rows = tuple(row[:width] for row in table.rows)
+    return replace(table, columns=table.columns[:width], rows=rows, notes=table.notes[_DEFINITIONS:])
 
 
 def _scenarios(results: Results, p: int) -> str | int:

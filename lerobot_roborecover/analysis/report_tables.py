@@ -58,7 +58,9 @@ def all_tables(results: Results) -> list[Table]:
     if len(results.recovery.arms) > 1:
         tables.append(oracle_table(results))
     tables += [budgets(results), *retry_tables(results)]
-    tables += [trial_metrics(results.recovery, results.draws), variance(results)]
+    tables.append(trial_metrics(results.recovery, results.draws))
+    if (results.recovery.trials > 1).any():
+        tables.append(variance(results))
     if results.costs:
         tables += [interventions(results), *gain_tables(results)]
     if published.policies(results.study.platform):
@@ -115,14 +117,21 @@ def sources_by_policy(results: Results) -> Table:
     """Source × recovery matrix with the observed-best alternative's gain."""
     panel = results.recovery
     found = source_matrix(panel, results.draws)
+    sparse = frozenset(i for i, row in enumerate(found) if row.underpowered)
+    columns = (
+        Column("Source policy"), Column("N", "count"), *(Column(p, "percent") for p in panel.arms)
+    )  # fmt: skip
+    if len(panel.arms) == 1:
+        rows = tuple((row.source_policy, row.scenarios, *row.rates) for row in found)
+        notes = ("RSR in % on natural scenarios, by the policy whose rollout led to them.",)
+        return Table("source_matrix", "RSR by source policy", columns, rows, notes, sparse)
     rows = []
     for row in found:
         best = panel.arms[row.best_other] if row.best_other is not None else "none"
         rows.append(
             (row.source_policy, row.scenarios, *row.rates, best, row.gain or UNDEFINED, row.hindsight_gain)
         )
-    columns = (
-        Column("Source policy"), Column("N", "count"), *(Column(p, "percent") for p in panel.arms),
+    columns += (
         Column("Observed best other"), Column("Gain, cross-fitted", "points"),
         Column("Gain in hindsight", "points"),
     )  # fmt: skip
@@ -132,7 +141,6 @@ def sources_by_policy(results: Results) -> Table:
         "scenarios, where trials are single) and scored on the other half. In hindsight: the observed best, "
         "chosen and scored on the same trials, and so too high.",
     )
-    sparse = frozenset(i for i, row in enumerate(found) if row.underpowered)
     return Table("source_matrix", "Source policy × recovery policy", columns, tuple(rows), notes, sparse)
 
 

@@ -22,8 +22,8 @@ class LogOptions:
     """Which trials, and how they are analysed; shared by the commands on trial logs."""
 
     logs: tuple[str, ...] = option(positional=True, metavar="[NAME=]LOG[,LOG]")
-    """Trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name; several after one
-    NAME are runs of one method."""
+    """Trial log, or a folder that holds trials.jsonl; NAME replaces the policy's own name; after one NAME
+    stand the logs of one policy, from both starts, or of several training runs of one method."""
     platform: str | None = None
     """Take this platform's rows only."""
     analysis: Options = field(default_factory=Options)

@@ -18,6 +18,8 @@ _INCHES = 7.2
 """Width for a page: it stands beside videos."""
 _GAP = 0.09
 """From a mark to its label, where the two axes are 1 apart."""
+_TICKS = (0, 25, 50, 75, 100)
+"""Per cent."""
 _APART = 5.2
 """Per cent between two labels, so that they do not overlap."""
 
@@ -88,7 +90,10 @@ def slope_of(
             )  # fmt: skip
             axes.set_yticks([])
             for x in (0, 1):
-                axes.axvline(x, color=style.LINE, lw=1, zorder=0)
+                axes.plot([x, x], [0, 100], color=style.LINE, lw=1, zorder=0)
+                axes.plot([x] * len(_TICKS), _TICKS, "_", color=style.LINE, ms=7, zorder=0)
+            for tick in _TICKS:
+                axes.text(0.04, tick, f"{tick}", color=style.SOFT, fontsize=7, va="center", zorder=0)
             axes.spines[:].set_visible(False)
             axes.tick_params(length=0, labelcolor=style.SOFT)
         return plot
