@@ -32,14 +32,10 @@ NAMED_KEYS = ("space", "enter", "tab", "backspace", "esc", "left", "right", "up"
 """What LeRobot's listener calls keys that are no character."""
 
 
-@dataclass
-class RobotSession:
-    """What every command with a robot takes."""
+@dataclass(kw_only=True)
+class ConsoleOptions:
+    """How people talk to a run on a robot."""
 
-    robot: RobotConfig
-    """LeRobot's own configuration of the robot and its cameras."""
-    teleop: TeleoperatorConfig | None = None
-    """LeRobot's own configuration of a teleoperator, for takeovers."""
     console_host: str = "127.0.0.1"
     """Where the console is served; 0.0.0.0 lets a phone on the same network in."""
     console_port: int = 8734
@@ -48,8 +44,6 @@ class RobotSession:
     """PEM certificate that makes the console https."""
     tls_key: Path | None = None
     """PEM key of the certificate."""
-    limits: dict[str, list[float]] = field(default_factory=dict)
-    """Lowest and highest position by joint, narrower than the calibrated ones."""
     keys: dict[str, str] = field(default_factory=dict)
     """Button by key of the terminal, beside the usual ones, e.g. `{b: mark}` for a pedal that types a b."""
     operator: str = ""
@@ -57,9 +51,6 @@ class RobotSession:
     alone."""
 
     def __post_init__(self) -> None:
-        for name, values in self.limits.items():
-            if len(values) != 2 or not all(map(math.isfinite, values)) or values[0] >= values[1]:
-                raise OptionError(f"--limits: {name}: {values} is not a lowest and a highest position")
         for key, button in self.keys.items():
             if button not in KEYS.values():
                 raise OptionError(f"--keys: no button {button!r:.40}; there are {', '.join(KEYS.values())}")
@@ -68,6 +59,24 @@ class RobotSession:
                 raise OptionError(f"--keys: {key!r:.40} is no key: write one character, or one of {names}")
         if self.operator not in ("", "simulated"):
             raise OptionError(f"--operator={self.operator}: not 'simulated', and not empty")
+
+
+@dataclass(kw_only=True)
+class RobotSession(ConsoleOptions):
+    """What every command with a robot takes."""
+
+    robot: RobotConfig
+    """LeRobot's own configuration of the robot and its cameras."""
+    teleop: TeleoperatorConfig | None = None
+    """LeRobot's own configuration of a teleoperator, for takeovers."""
+    limits: dict[str, list[float]] = field(default_factory=dict)
+    """Lowest and highest position by joint, narrower than the calibrated ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, values in self.limits.items():
+            if len(values) != 2 or not all(map(math.isfinite, values)) or values[0] >= values[1]:
+                raise OptionError(f"--limits: {name}: {values} is not a lowest and a highest position")
 
     @property
     def joint_limits(self) -> dict[str, tuple[float, float]]:
@@ -142,8 +151,6 @@ def session(config: RobotSession) -> Generator[Session]:
     """Connects the robot, and serves the console on phone and keyboard, for a block."""
     from lerobot.teleoperators import make_teleoperator_from_config
 
-    from lerobot_roborecover.robot.phone.server import Phone, PhoneConfig
-
     with ExitStack() as stack:
         robot = stack.enter_context(connected(config.robot))
         teleop = None
@@ -152,7 +159,16 @@ def session(config: RobotSession) -> Generator[Session]:
             with asking(teleop):
                 teleop.connect()
             stack.callback(teleop.disconnect)
-        console = Console(_operator(config, robot))
+        yield Session(robot, stack.enter_context(served_console(config, robot)), teleop)
+
+
+@contextmanager
+def served_console(config: ConsoleOptions, robot: Any) -> Generator[Console]:
+    """Serves the console of a connected robot on phone and keyboard, for a block."""
+    from lerobot_roborecover.robot.phone.server import Phone, PhoneConfig
+
+    console = Console(_operator(config, robot))
+    with ExitStack() as stack:
         if not config.operator:
             phone = Phone(
                 console,
@@ -163,7 +179,7 @@ def session(config: RobotSession) -> Generator[Session]:
             listener = _keyboard(console, config.keys)
             if listener is not None:
                 stack.callback(listener.stop)
-        yield Session(robot, console, teleop)
+        yield console
 
 
 @contextmanager
@@ -178,7 +194,7 @@ def _last_words(console: Console) -> Generator[None]:
         console.show("over", "Done. The terminal has the result.")
 
 
-def _operator(config: RobotSession, robot: Any) -> Any:
+def _operator(config: ConsoleOptions, robot: Any) -> Any:
     from lerobot_roborecover.robot.lab.operator import SimulatedHands, SimulatedOperator
 
     in_lab = hasattr(robot, "world")

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from lerobot.rollout.configs import BaseStrategyConfig
-from lerobot.rollout.strategies.core import RolloutStrategy, send_next_action
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
@@ -47,8 +45,11 @@ class RolloutEnd:
     clock_jump_s: float = 0.0
 
 
-class RecordedRollout(RolloutStrategy):
+class RecordedRollout:
     """Runs a policy until time is up, a button is pressed, or something breaks; records every frame.
+
+    The loop is that of LeRobot's strategies. Of LeRobot it takes the public parts alone (engine, processors,
+    robot): what its strategies share among themselves changes between versions.
 
     Args:
         recorder: gets the frames.
@@ -70,9 +71,7 @@ class RecordedRollout(RolloutStrategy):
         columns: Mapping[str, Any] | None = None,
         watch: FailureWatch | None = None,
     ):
-        super().__init__(BaseStrategyConfig())
         self._engine: Any = None
-        self._interpolator: Any = None
         self._recorder, self._console, self._limit_s = recorder, console, limit_s
         self._instruction, self._teleop, self._columns = instruction, teleop, columns
         self._watch = watch
@@ -82,7 +81,9 @@ class RecordedRollout(RolloutStrategy):
     def setup(self, ctx: Any) -> None:
         """Gives the policy a fresh history and starts its engine."""
         self.end, self._same = RolloutEnd(), {}
-        self._init_engine(ctx)
+        self._engine = ctx.policy.inference
+        self._engine.reset()
+        self._engine.start()
 
     def run(self, ctx: Any) -> None:
         """Runs the loop; `end` says how it ended. What was recorded is kept, whatever happens."""
@@ -113,8 +114,9 @@ class RecordedRollout(RolloutStrategy):
 
     def _loop(self, ctx: Any, digest: Any) -> None:
         robot, clock = ctx.hardware.robot_wrapper, clock_of(ctx.hardware.robot_wrapper.inner.held)
-        interval = self._interpolator.get_control_interval(ctx.runtime.cfg.fps)
+        interval = 1 / ctx.runtime.cfg.fps
         features, driving = ctx.data.dataset_features, False
+        compiling = ctx.runtime.cfg.use_torch_compile
         horizon = round(self._limit_s * ctx.runtime.cfg.fps)
         start = clock.now()
         self._engine.resume()
@@ -135,14 +137,17 @@ class RecordedRollout(RolloutStrategy):
             if problem := self._frozen(robot, observation, tick):
                 self.end.ended, self.end.problem = "trouble", problem
                 return
-            processed = self._process_observation_and_notify(ctx.processors, observation)
-            if self._handle_warmup(ctx.runtime.cfg.use_torch_compile, tick, interval):
+            processed = ctx.processors.robot_observation_processor(observation)
+            self._engine.notify_observation(processed)
+            if compiling:
+                compiling = not self._engine.ready
+                if not compiling:  # what it inferred while it compiled is stale
+                    self._engine.reset()
+                    self._engine.resume()
+                clock.sleep(interval - (clock.now() - tick))
                 continue
-            action = (
-                self._person_acts(ctx, observation)
-                if driving
-                else send_next_action(processed, observation, ctx, self._interpolator)
-            )
+            acts = self._person_acts if driving else self._policy_acts
+            action = acts(ctx, observation, processed)
             if action is not None:
                 frame = {
                     **build_dataset_frame(features, processed, prefix=OBS_STR),
@@ -183,7 +188,6 @@ class RecordedRollout(RolloutStrategy):
         elif answer.button == "handback" and driving:
             # As in simulation, the policy goes on with fresh history.
             self._engine.reset()
-            self._interpolator.reset()
             self._engine.resume()
             return False, False
         elif answer.button in ("end", "success", "failure"):
@@ -191,7 +195,22 @@ class RecordedRollout(RolloutStrategy):
             return driving, True
         return driving, False
 
-    def _person_acts(self, ctx: Any, observation: dict[str, Any]) -> dict[str, Any]:
+    def _policy_acts(
+        self, ctx: Any, observation: dict[str, Any], processed: dict[str, Any]
+    ) -> dict[str, Any] | None:
+        """Sends the policy's next action and returns it; None where its thread has none yet."""
+        frame = build_dataset_frame(ctx.data.dataset_features, processed, prefix=OBS_STR)
+        values = self._engine.get_action(frame)
+        if values is None:
+            return None
+        names = ctx.data.ordered_action_keys
+        action = {name: value.item() for name, value in zip(names, values.cpu(), strict=True)}
+        ctx.hardware.robot_wrapper.send_action(ctx.processors.robot_action_processor((action, observation)))
+        return action
+
+    def _person_acts(
+        self, ctx: Any, observation: dict[str, Any], processed: dict[str, Any]
+    ) -> dict[str, Any]:
         """Sends the teleoperator's action and returns it."""
         with asking(self._teleop):
             given = self._teleop.get_action()

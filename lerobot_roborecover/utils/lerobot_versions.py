@@ -52,6 +52,13 @@ class Replaced:
     """Whether the installed LeRobot has it; imports LeRobot."""
 
 
+def takes_strategies() -> bool:
+    """Returns whether `lerobot-rollout` runs strategies of other packages (huggingface/lerobot#4559)."""
+    from lerobot.rollout.configs import RolloutStrategyConfig
+
+    return hasattr(RolloutStrategyConfig, "requires_teleop")
+
+
 def averages_weights() -> bool:
     """Returns whether `lerobot-train` averages weights itself (huggingface/lerobot#4323)."""
     return "ema" in _training_fields()
