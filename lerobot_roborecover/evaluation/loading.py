@@ -110,7 +110,10 @@ def _load_host(spec: HostSpec) -> PolicyRunner:
     env_pre, env_post = env_processors(spec.env, spec.policy)
     if isinstance(policy, ProvidesRunner):
         return policy.make_host(env_pre, env_post, preprocessor, spec.max_batch)
-    return LocalPolicyRunner(policy, env_pre, env_post, preprocessor, postprocessor, spec.max_batch)
+    return LocalPolicyRunner(
+        policy, env_pre, env_post, preprocessor, postprocessor, spec.max_batch,
+        tracebacks=not remedy_of(spec),
+    )  # fmt: skip
 
 
 def _check_trained(config: PreTrainedConfig, policy: Any) -> None:

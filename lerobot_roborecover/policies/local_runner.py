@@ -68,6 +68,8 @@ class LocalPolicyRunner:
         max_batch: slots asked for at once, at most; halved when a GPU runs out of memory.
         in_training: the policy will be trained on. What it keeps from an inference (a cached mask, say) must
             not be barred from autograd then.
+        tracebacks: log where the policy raised, the first time; not needed where its inputs are known to
+            lack.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class LocalPolicyRunner:
         max_batch: int = 64,
         *,
         in_training: bool = False,
+        tracebacks: bool = True,
     ):
         self._policy = policy
         self._config: Any = policy.config
@@ -100,6 +103,7 @@ class LocalPolicyRunner:
         self._device = next(policy.parameters()).device
         self._amp = bool(getattr(self._config, "use_amp", False))
         self._idle: list[PreTrainedPolicy] = []
+        self._tracebacks = tracebacks
         self._raised: set[str] = set()
 
     def noise(self, seed: int | None) -> str:
@@ -249,7 +253,9 @@ class LocalPolicyRunner:
 
     def _warn(self, problem: str) -> None:
         """Logs what the policy has just raised, with its traceback the first time."""
-        logger.warning("the policy raised %s", problem, exc_info=problem not in self._raised)
+        logger.warning(
+            "the policy raised %s", problem, exc_info=self._tracebacks and problem not in self._raised
+        )
         self._raised.add(problem)
 
     @property
