@@ -356,7 +356,6 @@ def test_actions_that_are_not_numbers(run, tmp_path, run_lerobot_eval, dataset):
     assert "Recovery success" not in out
     told = err.strip().splitlines()[-1]
     assert "the first 3 trials ended in the same policy error" in told
-    assert "Traceback" not in told, "what the policy lacks is known"
     assert "non-finite" in told
     assert "check policy" in told
     assert read_trial_log(tmp_path / "out" / "trials.jsonl") == []

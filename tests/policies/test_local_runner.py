@@ -52,11 +52,13 @@ def load(folder, kind, **changes):
     return policy, *make_pre_post_processors(config, pretrained_path=str(folder))
 
 
-def host_of(folder, kind, max_batch=64, **changes):
+def host_of(folder, kind, max_batch=64, tracebacks=True, **changes):
     from lerobot_roborecover.policies.local_runner import LocalPolicyRunner
 
     policy, pre, post = load(folder, kind, **changes)
-    return LocalPolicyRunner(policy, lambda batch: batch, lambda action: action, pre, post, max_batch)
+    return LocalPolicyRunner(
+        policy, lambda batch: batch, lambda action: action, pre, post, max_batch, tracebacks=tracebacks
+    )
 
 
 def engine_rows(dataset, log, host, slots):
@@ -134,6 +136,17 @@ def test_a_batch_gives_each_slot_what_it_gets_alone(checkpoints):
     for seed, (state, actions) in enumerate(zip(states, together, strict=True)):
         np.testing.assert_allclose(actions, ask(host, [seed], [state])[0], rtol=1e-4, atol=1e-4)
         assert actions.shape == (4, 2)
+
+
+@pytest.mark.parametrize("tracebacks", [True, False])
+def test_a_traceback_is_logged_once_where_it_is_asked_for(checkpoints, tracebacks, caplog):
+    host = host_of(checkpoints["act"], "act", tracebacks=tracebacks)
+    lacking = {"agent_pos": np.zeros(3, np.float32)}
+    for seed in (1, 2):
+        (answer,) = host.act([lacking], ["go"], [host.start(seed)])
+        assert isinstance(answer, PolicyError)
+    assert caplog.text.count("the policy raised") == 2
+    assert caplog.text.count("Traceback") == int(tracebacks)
 
 
 def test_mixed_precision_on_a_cpu_gives_actions_that_numpy_has(checkpoints):
