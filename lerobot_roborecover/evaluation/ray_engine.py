@@ -61,14 +61,14 @@ class RayReplica(RestartableActor):
     """A policy on the cluster. The histories the engine holds are tokens.
 
     Args:
-        make: makes the actor; told whether it is made again.
+        make: makes the actor.
         seed: the run's.
         limit_s: the watchdog: longest that one inference may take before the actor is replaced.
     """
 
     gone = ""
 
-    def __init__(self, make: Callable[[bool], Any], seed: int | None, limit_s: float = float("inf")):
+    def __init__(self, make: Callable[[], Any], seed: int | None, limit_s: float = float("inf")):
         self._limit_s = limit_s
         self.max_batch, self.batched, self._noise = 1, True, ""
         self._tokens = 0
@@ -168,11 +168,14 @@ def open_ray_engine(
     workers = run.pool.worker_slots(count if most is None else min(count, most))
     # What decides how policies round here decides it there: torch reads these variables when it is loaded.
     chosen = {name: os.environ[name] for name in KERNELS if name in os.environ}
-    policy = ray.remote(num_cpus=1, num_gpus=gpus, runtime_env={"env_vars": chosen})(PolicyActor)
+    # `room` has left a CPU to each copy. Ray is not asked for it: once a node is lost, simulators may have
+    # all CPUs, and would wait for the policy while it waits for a CPU.
+    policy = ray.remote(
+        num_cpus=0, num_gpus=gpus, scheduling_strategy="SPREAD", runtime_env={"env_vars": chosen}
+    )(PolicyActor)
 
-    def put(again: bool) -> Any:
-        # Where simulators have all CPUs that are left, they would wait for it for ever.
-        return (policy.options(num_cpus=0) if again else policy).remote(make_host)
+    def put() -> Any:
+        return policy.remote(make_host)
 
     parts = [RayReplica(put, run.protocol.run_seed, run.policy_watchdog_s) for _ in range(replicas)]
     for part in parts:

@@ -81,25 +81,25 @@ class RestartableActor:
     """An actor that is made again when it is lost; one call under way at a time.
 
     Args:
-        make: makes the actor; told whether it is made again.
+        make: makes the actor.
         first: calls the method whose answer says that it is there.
     """
 
     deadline = float("inf")
 
-    def __init__(self, make: Callable[[bool], Any], first: Callable[[Any], Any]):
+    def __init__(self, make: Callable[[], Any], first: Callable[[Any], Any]):
         self._make, self._first = make, first
         self._failed = 0
-        self._start(again=False)
+        self._start()
 
-    def _start(self, *, again: bool) -> None:
+    def _start(self) -> None:
         self.starting = True
-        self._actor = self._make(again)
+        self._actor = self._make()
         self.ready = self._first(self._actor)
 
     def _start_again(self) -> None:
         self.close()
-        self._start(again=True)
+        self._start()
 
     def poll_startup(self) -> None:
         """Finds out whether the actor is there; if its node went away meanwhile, begins again.
@@ -191,7 +191,7 @@ class RaySlot(RestartableActor):
     wait = staticmethod(wait_for_calls)
 
     def __init__(
-        self, make: Callable[[bool], Any], platform: str, check: Callable[[SlotFailure | None, str], None]
+        self, make: Callable[[], Any], platform: str, check: Callable[[SlotFailure | None, str], None]
     ):
         self._platform, self._check, self._working = platform, check, False
         super().__init__(make, lambda actor: actor.begin.remote())
@@ -304,10 +304,8 @@ class Cluster:
         actor = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(SlotActor)
 
         def make(config: SlotConfig, timeout_s: float, turn: int) -> RaySlot:
-            def put(again: bool) -> Any:
-                # Where policies have all CPUs that are left, one simulator goes on all the same.
-                one = actor.options(num_cpus=0) if again and turn == 0 else actor
-                return one.remote(config, timeout_s, turn, startup.environment, startup.first)
+            def put() -> Any:
+                return actor.remote(config, timeout_s, turn, startup.environment, startup.first)
 
             return RaySlot(put, config.platform, startup.check)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections import Counter
 from dataclasses import replace
 from functools import partial
@@ -24,6 +25,7 @@ from lerobot_roborecover.workers.messages import SlotConfig
 from tests.evaluation.test_local_engine import PushHost
 from tests.support.factories import fake_dataset, save_policy
 from tests.support.loop import evaluate, outcomes
+from tests.support.processes import PATIENCE_S
 from tests.support.ray_cluster import two_nodes
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.nightly]
@@ -86,7 +88,8 @@ def run_on(
         units = units_of(list(scenarios), TRIALS)
         there = EngineConfig(Backend("ray", prefix="--runner.", count="slots"), slots, **(places or {}))
         engine = open_engine(run, units, make_host, there, on_row=lambda row: on_row(engine))
-        engine.run(units)
+        until = time.monotonic() + PATIENCE_S
+        engine.run(units, lambda: time.monotonic() > until)
     finally:
         run.pool.release()
     return read_trial_log(log), engine.reruns
@@ -99,6 +102,26 @@ def test_two_nodes_give_the_same_rows(cluster, dataset, reference, tmp_path):
     assert {r.noise for r in rows} == {"per_trial"}
     with pytest.raises(OptionError, match=r"9 simulators and 1 .* need 10 CPUs; .* has 4.*slots=3"):
         run_on(dataset, tmp_path / "more.jsonl", slots=9)
+
+
+class Busy:
+    """What others run on a cluster."""
+
+    def there(self):
+        return True
+
+
+def test_simulators_on_all_cpus_do_not_keep_the_policy_out(cluster, dataset, reference, tmp_path):
+    """A node may go, or be taken, once the CPUs have been counted."""
+    import ray
+
+    busy = ray.remote(num_cpus=1)(Busy).remote()
+    assert ray.get(busy.there.remote())
+    try:
+        rows, _ = run_on(dataset, tmp_path / "log.jsonl", slots=3)
+    finally:
+        ray.kill(busy)
+    assert outcomes(rows) == reference
 
 
 def test_a_policy_that_dies_costs_the_trials_in_flight_and_they_are_run_again(
