@@ -33,7 +33,13 @@ from lerobot_roborecover.policies.runner import (
     ReplicaLostError,
 )
 from lerobot_roborecover.scenario import Outcome, TrialStart
-from lerobot_roborecover.workers.messages import ActResult, EpisodeStart, RollbackReply, SlotFailure
+from lerobot_roborecover.workers.messages import (
+    ActResult,
+    EpisodeStart,
+    RollbackReply,
+    SlotFailure,
+    video_stride,
+)
 from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SimulatorWorker
 
 MAX_CONSECUTIVE_FAILURES = 3
@@ -316,7 +322,8 @@ class Engine:
             self._timers[active.replica].simulated(active.answered_with, reply.seconds)
         active.trial.on_reply(reply)
         if self._videos is not None and isinstance(reply, EpisodeStart) and reply.frame is not None:
-            active.recording = self._videos.begin(active.unit, reply.frame, reply.hz)
+            fps = reply.hz / video_stride(reply.hz)
+            active.recording = self._videos.begin(active.unit, reply.frame, fps)
         elif active.recording is not None and isinstance(reply, ActResult):
             active.recording.add(reply.frames)
         elif active.recording is not None and isinstance(reply, RollbackReply) and reply.frame is not None:

@@ -169,7 +169,7 @@ class Trial:
         """Starts it: what a simulator needs for the handoff.
 
         Args:
-            record_video: replies are to bring a frame of every step.
+            record_video: replies are to bring frames for a video.
         """
         self._leave(TrialState.NEW, to=TrialState.HANDING_OFF)
         return EpisodeSpec(

@@ -86,6 +86,15 @@ class InProgress:
     """Reply before the result: the command is running; send it again without an argument to continue."""
 
 
+def video_stride(hz: float) -> int:
+    """Steps from one frame of a video to the next: 20 frames a second, and not 80 of Meta-World.
+
+    Args:
+        hz: control steps a second.
+    """
+    return max(1, round(hz / 20))
+
+
 @dataclass(frozen=True)
 class EpisodeSpec:
     """One trial's start."""
@@ -95,7 +104,7 @@ class EpisodeSpec:
     rewind_steps: int
     handoff_check: bool
     record_video: bool = False
-    """Whether replies to `reset` and `act` bring a frame of every step, for a video."""
+    """Whether replies to `reset` and `act` bring frames for a video, see `video_stride`."""
     rollback_steps: int = 0
     """Most steps of a rollback: snapshots of as many steps are kept, where they are exact."""
     played: np.ndarray | None = None

@@ -33,6 +33,7 @@ from lerobot_roborecover.workers.messages import (
     Server,
     SlotConfig,
     SlotFailure,
+    video_stride,
 )
 from lerobot_roborecover.workers.parent import end_with_parent
 from lerobot_roborecover.workers.recovery_env import RecoveryEnv
@@ -51,7 +52,7 @@ class SlotServer:
         folder = Path(config.snapshot_dir) if config.snapshot_dir else None
         self._cache = SnapshotCache(folder=folder, approximate=config.approximate_snapshots)
         self._env: RecoveryEnv | None = None
-        self._record_video = False
+        self._record_video, self._stepped = False, 0
 
     def answer(self, command: str, argument: Any = None) -> Any:
         """Runs one command: `spaces`, `reset`, `step`, `act`, `rollback`, `render`, `smoke`, `state` or
@@ -93,7 +94,7 @@ class SlotServer:
         )
         observation, _ = self._env.reset()
         assert self._env.handoff is not None
-        self._record_video = spec.record_video
+        self._record_video, self._stepped = spec.record_video, 0
         frame = self._env.render() if spec.record_video else None
         hz = self._simulator.control_hz
         return EpisodeStart(observation, self._env.handoff, frame, hz, self._env.progress())
@@ -109,20 +110,22 @@ class SlotServer:
 
     def _act(self, actions: np.ndarray, *, observe: bool = False) -> ActResult:
         """Executes (n, A) actions, up to success or the horizon; renders at the end alone, and only if it
-        goes on, or with `observe`. A trial that records a video renders every step."""
+        goes on, or with `observe`. A trial that records a video renders the steps of `video_stride`, and its
+        last."""
         assert self._env is not None
         began = time.perf_counter()
         success = over = False
         steps = 0
-        frames, progress = [], []
+        frames, progress, stride = [], [], video_stride(self._simulator.control_hz)
         for action in actions:
             success = self._env.advance(action)
             steps += 1
-            if self._record_video:
+            self._stepped += 1
+            over = success or self._env.out_of_steps
+            if self._record_video and (over or self._stepped % stride == 0):
                 frames.append(self._env.render().copy())
             if (done := self._env.progress()) is not None:
                 progress.append(done)
-            over = success or self._env.out_of_steps
             if over:
                 break
         observation = self._simulator.observe() if observe or not over else None
