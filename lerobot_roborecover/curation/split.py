@@ -31,6 +31,8 @@ from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.options import internal, option
 
 APART = ("trajectory", "record", "instruction", "start")
+UNSCREENED = "unscreened"
+"""Split of the scenarios that stay whatever screening policies do with them."""
 
 
 def _apart(text: str) -> tuple[str, ...] | None:
@@ -220,6 +222,34 @@ def groups_of(scenarios: Sequence[Scenario], apart: Sequence[str]) -> list[list[
         groups[root(i)].append(i)
     ordered = [sorted(members, key=lambda i: scenarios[i].id) for members in groups.values()]
     return sorted(ordered, key=lambda members: scenarios[members[0]].id)
+
+
+def draw_unscreened(scenarios: Sequence[Scenario], count: int, seed: int) -> set[str]:
+    """Draws scenarios before they are screened: whole groups that share a first state, or anything that may
+    never be shared, so that no other split shares it with them.
+
+    Args:
+        scenarios: of one platform; their order does not matter.
+        count: how many at least; the last group may bring a few more.
+        seed: of the draw.
+
+    Returns:
+        Their ids.
+
+    Raises:
+        ScenarioError: there are not as many.
+    """
+    if count >= len(scenarios) > 0:
+        raise ScenarioError(
+            f"--unscreened {count}: the dataset has {len(scenarios)}, and some have to be left to screen"
+        )
+    apart = sorted({*apart_for(scenarios, None), "start"}) if count else ()
+    groups, found = groups_of(scenarios, apart) if count else [], set[str]()
+    for i in np.random.default_rng(seed).permutation(len(groups)):
+        if len(found) >= count:
+            break
+        found |= {scenarios[k].id for k in groups[i]}
+    return found
 
 
 def assign(scenarios: Sequence[Scenario], config: SplitConfig) -> dict[str, str]:

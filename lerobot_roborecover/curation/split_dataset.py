@@ -19,7 +19,14 @@ from lerobot_roborecover.curation.funnel import (
     read_decisions,
     record_decisions,
 )
-from lerobot_roborecover.curation.split import SplitConfig, apart_for, assign, groups_of, shared
+from lerobot_roborecover.curation.split import (
+    UNSCREENED,
+    SplitConfig,
+    apart_for,
+    assign,
+    groups_of,
+    shared,
+)
 from lerobot_roborecover.datasets.contents import list_files
 from lerobot_roborecover.datasets.files import FolderUpdate, update_folder
 from lerobot_roborecover.datasets.frame_files import FrameStore
@@ -84,11 +91,16 @@ def _divide(
 ) -> SplitReport:
     """Draws the splits of a dataset, and writes them where there is an update to write to."""
     scenarios, manifest = read_with_manifest(root)
-    splits = assign(scenarios, config)
-    divided = [replace(s, split=splits[s.id]) for s in scenarios]
+    splits = assign([s for s in scenarios if s.split != UNSCREENED], config)
+    divided = [replace(s, split=splits.get(s.id, UNSCREENED)) for s in scenarios]
     report = report_splits(divided, config.apart)
     if any(report.leaks.values()):
-        raise AssertionError(f"groups were torn apart: {report.leaks}")
+        key, ((value, ids), *_) = next((k, found) for k, found in report.leaks.items() if found)
+        raise ScenarioError(
+            f"{', '.join(ids[:3])} share {key} {value[:60]!r}, and one of them is of the unscreened sample, "
+            "which was drawn apart by what fits the platform and by the start. Leave --disjoint-by out, or "
+            "screen again with this sample's size"
+        )
     if update is None:
         return report
     changed = [s.id for s, d in zip(scenarios, divided, strict=True) if s.split != d.split]

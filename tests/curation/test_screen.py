@@ -128,6 +128,26 @@ def test_shards_and_resume_change_nothing(screened, scenario_set, checkpoints, t
     assert take_trials(tmp_path / "part-0" / "calm", tmp_path / "out.trials" / "calm") == 0
 
 
+@pytest.mark.lerobot
+def test_an_unscreened_sample_stays_whatever_its_trials_say(
+    screened, scenario_set, checkpoints, tmp_path, capsys
+):
+    out, trials = tmp_path / "out", str(screened.with_name("out.trials"))
+    more = ("--unscreened", "5", "--trials-folder", trials)
+    assert main(command(scenario_set, checkpoints, out, *more)) == 0
+    assert "beside them 5 scenarios drawn at random, unscreened" in capsys.readouterr().out
+    record = json.loads((out / "meta/roborecover/screening.json").read_text())
+    sample = {s.id for s in read_scenarios(out) if s.split == "unscreened"}
+    assert sorted(sample) == record["unscreened"]
+    assert len(sample) == 5
+    kept = {s.id for s in read_scenarios(screened)}
+    assert sample - kept, "some that screening would drop"
+    assert {s.id for s in read_scenarios(out)} == kept | sample
+    last = {d.candidate: d for d in read_decisions(out) if d.stage == "screen"}
+    assert {last[i].by for i in sample} == {"drawn at random before screening"}
+    assert {last[i].verdict for i in sample} == {"kept"}
+
+
 @pytest.mark.nightly
 @pytest.mark.lerobot
 def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):

@@ -16,8 +16,10 @@ from lerobot_roborecover.cli import split as command
 from lerobot_roborecover.cli.arguments import Parser, add_options, read_options
 from lerobot_roborecover.curation.funnel import Decision, count_stages, read_decisions, record_decisions
 from lerobot_roborecover.curation.split import (
+    UNSCREENED,
     SplitConfig,
     assign,
+    draw_unscreened,
     groups_of,
     parse_apart,
     parse_least,
@@ -66,6 +68,21 @@ def grouped_sets(draw):
         )
         for i in range(count)
     ]
+
+
+@settings(max_examples=20, deadline=None)
+@given(grouped_sets(), st.data(), st.integers(0, 3), st.randoms())
+def test_an_unscreened_sample_is_whole_groups_whatever_the_order(scenarios, data, seed, shuffle):
+    count = data.draw(st.integers(0, len(scenarios) - 1))
+    sample = draw_unscreened(scenarios, count, seed)
+    groups = groups_of(scenarios, ("trajectory", "record", "start"))
+    assert len(sample) >= count
+    assert len(sample) < count + max(map(len, groups))
+    for members in groups:
+        assert len({scenarios[i].id in sample for i in members}) == 1
+    mixed = list(scenarios)
+    shuffle.shuffle(mixed)
+    assert draw_unscreened(mixed, count, seed) == sample
 
 
 @settings(max_examples=20, deadline=None)
@@ -262,6 +279,19 @@ def test_the_command_divides_in_place_and_refuses_to_do_it_again(tmp_path, capsy
     assert run(root, "--train", 2, "--test", 8, "--out", copy) == 0
     assert Counter(s.split for s in load_scenarios(copy)) == {"train": 2, "test": 8}
     assert Counter(s.split for s in load_scenarios(root)) == {"train": 8, "test": 2}
+
+
+def test_an_unscreened_sample_stays_one(tmp_path, capsys):
+    made = [scenario(i, split=UNSCREENED if i < 4 else "test") for i in range(12)]
+    root = write_scenarios(tmp_path / "set", made)
+    report = split_dataset(root, SplitConfig({"train": 6, "test": 2}))
+    assert report.counts == {"test": 2, "train": 6, UNSCREENED: 4}
+    assert {s.id for s in load_scenarios(str(root), split=UNSCREENED)} == {s.id for s in made[:4]}
+    shared = [replace(s, cluster="one") if s.id in ("s0003", "s0004") else s for s in made]
+    with pytest.raises(ScenarioError, match=r"s0003, s0004 share trajectory 'one'.* unscreened sample"):
+        split_dataset(write_scenarios(tmp_path / "torn", shared), SplitConfig({"train": 6, "test": 2}))
+    with pytest.raises(ScenarioError, match="--unscreened 12: the dataset has 12"):
+        draw_unscreened(made, 12, 0)
 
 
 def test_leakage_that_is_there_is_reported(tmp_path, capsys):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from lerobot_roborecover.curation.funnel import attrition_table, count_stages, read_decisions
+from lerobot_roborecover.curation.funnel import Decision, attrition_table, count_stages, read_decisions
 from lerobot_roborecover.curation.screen.runs import (
     PolicySpec,
     check_policies,
@@ -27,6 +27,7 @@ from lerobot_roborecover.curation.screen.tables import (
     format_settled,
     histogram,
 )
+from lerobot_roborecover.curation.split import UNSCREENED, draw_unscreened
 from lerobot_roborecover.curation.stage_dataset import write_stage
 from lerobot_roborecover.datasets import ScenarioSet, load_scenarios, read_scenarios
 from lerobot_roborecover.datasets.frame_files import FrameStore
@@ -68,8 +69,11 @@ class ScreenRequest:
     """Run this part's trials only, and write no dataset."""
     retry: Sequence[str] = option((), text="", metavar="OUTCOMES", parse=_outcomes)
     """Run invalid trials of these outcomes again, e.g. policy_error,timeout."""
+    unscreened: int = option(0, metavar="N")
+    """So many scenarios, drawn at random, stay whatever the trials say, as split `unscreened`: what screening
+    does to ranks is seen on them."""
     run_seed: int = 1000
-    """Run seed of the trials."""
+    """Run seed of the trials, and seed of that draw."""
     device: str | None = None
     """Device of the policies."""
     slots: int = option(0, name="num-workers", old=("slots",))
@@ -116,6 +120,8 @@ class Screening:
     """Empty where only a shard's trials were run."""
     rows: Mapping[str, Sequence[TrialRow]]
     """Rows by the policy's name."""
+    unscreened: Collection[str] = ()
+    """Ids of the sample that stays whatever the trials say."""
 
 
 def screen_dataset(
@@ -137,6 +143,7 @@ def screen_dataset(
     if not request.shard:
         check_new(request.out)
     scenarios = load_scenarios(request.dataset)
+    sample = draw_unscreened(list(scenarios), request.unscreened, request.run_seed)
     for policy in request.policies:
         folder = request.trials / policy.name
         for other in request.trials_from:
@@ -150,15 +157,20 @@ def screen_dataset(
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic)
     source = Path(request.dataset).expanduser()
+    decisions = [_decision(s, sample) for s in found]
     write_stage(
         request.out,
         source if source.is_dir() else None,
-        [_screened(s, request.run_seed) for s in found if s.decision.verdict == "kept"],
-        (s.decision for s in found),
-        (SCREENING_FILE, _record(found, request, rows)),
+        [
+            _screened(s, request.run_seed, sample)
+            for s, decision in zip(found, decisions, strict=True)
+            if decision.verdict == "kept"
+        ],
+        decisions,
+        (SCREENING_FILE, _record(found, request, rows, sample)),
         scenarios.manifest,
     )
-    return Screening(found, rows)
+    return Screening(found, rows, sample)
 
 
 def _trials(
@@ -218,11 +230,13 @@ def describe(request: ScreenRequest, made: Screening) -> str:
         return f"part {request.shard}: trials in {request.trials}; join with --trials-from {request.trials}"
     rule, policies = request.rule, len(request.policies)
     low, high = rule.check(policies)
-    kept = sum(s.decision.verdict == "kept" for s in made.found)
+    kept = sum(s.decision.verdict == "kept" and s.scenario.id not in made.unscreened for s in made.found)
     head = (
         f"{kept} of {pluralize(len(made.found), 'scenario')} in {request.out}: {low} to {high} successes of "
         f"{policies * rule.trials} ({pluralize(policies, 'policy')} x {pluralize(rule.trials, 'trial')})"
     )
+    if made.unscreened:
+        head += f"; beside them {pluralize(len(made.unscreened), 'scenario')} drawn at random, unscreened"
     tables = (
         format_policies(made.found),
         format_settled(made.found) if rule.curtail else format_histogram(made.found, rule),
@@ -241,19 +255,30 @@ def validate_next(out: Path, trials: Path) -> list[str]:
     return [*argv, "--out", "VALIDATED"]
 
 
-def _screened(found: Screened, run_seed: int) -> Scenario:
-    note = provenance_of(found, run_seed)
-    return replace(found.scenario, provenance={**found.scenario.provenance, "screening": note})
+def _decision(found: Screened, sample: Collection[str]) -> Decision:
+    if found.scenario.id not in sample:
+        return found.decision
+    return replace(found.decision, verdict="kept", reason="", by="drawn at random before screening")
+
+
+def _screened(found: Screened, run_seed: int, sample: Collection[str]) -> Scenario:
+    scenario, note = found.scenario, provenance_of(found, run_seed)
+    split = UNSCREENED if scenario.id in sample else scenario.split
+    return replace(scenario, split=split, provenance={**scenario.provenance, "screening": note})
 
 
 def _record(
-    found: Sequence[Screened], request: ScreenRequest, rows: Mapping[str, Sequence[TrialRow]]
+    found: Sequence[Screened],
+    request: ScreenRequest,
+    rows: Mapping[str, Sequence[TrialRow]],
+    sample: Collection[str],
 ) -> dict:
     low, high = request.rule.check(len(request.policies))
     return {
         "rule": {**asdict(request.rule), "successes": [low, high]},
         "deterministic": sorted(request.deterministic),
         "run_seed": request.run_seed,
+        **({UNSCREENED: sorted(sample)} if sample else {}),
         "env": list(request.env),
         "policies": [
             {
