@@ -1,12 +1,13 @@
-"""First states of trial rows that do not say theirs: logs before schema 3.
+"""What the scenario sets that trial rows name say of them, where a set is on this machine: first states of
+rows that do not say theirs (logs before schema 3), and which of the policies have screened it.
 
-They are looked up in the scenario set that the rows name, where it is on this machine, and in the sets that
-come with the package. A scenario is only taken for another's where its content hash is the same.
+First states are looked up in the sets that come with the package, too. A scenario is only taken for another's
+where its content hash is the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -52,6 +53,44 @@ def with_first_states(logs: Sequence[ReadLog]) -> tuple[list[ReadLog], list[str]
         "state rates, and retention, may be too narrow. Run the initial-state trials again, or put the set "
         "where the rows name it"
     ]
+
+
+def screening_remark(logs: Iterable[ReadLog]) -> list[str]:
+    """A remark where policies of the logs have the name of one that screened their scenarios.
+
+    Args:
+        logs: as they were read.
+    """
+    found: dict[str, str] = {}
+    for log in logs:
+        sets = dict.fromkeys((row.dataset, row.dataset_revision) for row in log.rows)
+        screeners = {policy.partition("@")[0]: policy for one in sets for policy in _screeners(*one)}
+        for policy in log.policies:
+            if (name := policy.partition("@")[0]) in screeners:
+                found[name] = screeners[name]
+    if not found:
+        return []
+    return [
+        f"{', '.join(sorted(found))}: a policy of this name ({', '.join(sorted(found.values()))}) screened "
+        "the scenarios, which are those that some, but not all, of the screening policies recover from. Its "
+        "rate, and its rank among policies that did not screen them, hold for this set only"
+    ]
+
+
+@lru_cache(maxsize=32)
+def _screeners(dataset: str, revision: str | None) -> frozenset[str]:
+    """Returns the policies that screened a set that is on this machine."""
+    try:
+        notes = [s.provenance.get("screening") for s in _scenarios(dataset, revision)]
+    except (ScenarioError, OSError):
+        return frozenset()
+    counts = [
+        count
+        for note in notes
+        if isinstance(note, Mapping) and isinstance(note.get("policies"), Mapping)
+        for count in note["policies"].values()
+    ]
+    return frozenset(str(c["policy"]) for c in counts if isinstance(c, Mapping) and c.get("policy"))
 
 
 def _filled(row: TrialRow, found: _Found) -> TrialRow:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,14 +71,15 @@ def headline_of(results: Results) -> Headline:
             "every scenario the same number of times."
         )
     initial = initial_estimates(results)[results.compared.policies[best]].value
-    first = "" if math.isnan(initial) else f"from initial states in {100 * initial:.1f} % and "
+    first = "" if math.isnan(initial) else f"{100 * initial:.1f} % from initial states, "
     claim = (
-        f"{name} succeeds {first}from recovery points in {100 * rate.value:.1f} % of trials"
+        f"Success of {name}: {first}{100 * rate.value:.1f} % from recovery points"
         f"{_intervals(results, best, rate)}."
     )
     rivals = [results.ranked.arms[p] for p in valid[1:]]
     if rivals and results.judged and name not in results.barred:
-        claim += f" {_standing(name, [results.contrast(name, rival) for rival in rivals])}"
+        rates = {results.ranked.arms[p]: results.ranked_rates[p].value for p in valid}
+        claim += f" {_standing(name, [results.contrast(name, rival) for rival in rivals], rates)}"
     return Headline(claim, tuple(sentences))
 
 
@@ -102,7 +104,7 @@ def _intervals(results: Results, best: int, rate: Estimate) -> str:
         draws = results.tasks.part(np.array(results.compared.scenarios, int))
         (tasks,) = draws.rates(results.ranked.rates[[best]].T)
         if not math.isnan(tasks.low):
-            text += f"; for other tasks like these {draws.units}: {_bounds(tasks)}"
+            return f"{text}). The interval for other tasks than these {draws.units} is {_bounds(tasks)}"
     return text + ")"
 
 
@@ -120,21 +122,22 @@ def _who(results: Results) -> str:
     return f"{on}; not ranked, because not run on all of these: {', '.join(results.left_out)}."
 
 
-def _standing(best: str, found: list[Contrast]) -> str:
+def _standing(best: str, found: list[Contrast], rates: Mapping[str, float]) -> str:
     """Lists the policies that the first is separated from, and those that it is not."""
     few = [c.b for c in found if c.verdict is ComparisonVerdict.TOO_FEW]
     barred = [c.b for c in found if c.barred is not None]
     level = [c.b for c in found if not c.verdict.separated and c.b not in (*few, *barred)]
     if not few and not level and not barred:
         others = "the other policy" if len(found) == 1 else f"all {len(found)} other policies"
-        return f"It is separated from {others}."
+        return f"{best} is separated from {others}."
     parts = []
     if level:
-        parts.append(f"Not separated from it with these trials: {', '.join(level)}.")
+        named = ", ".join(f"{policy} ({100 * rates[policy]:.1f} %)" for policy in level)
+        parts.append(f"Not separated from {best} with these trials: {named}.")
     if few:
         unit = found[0].unit
         parts.append(
-            f"No verdict on those that differ from it on fewer than {LEAST_DIFFERING} {unit}: "
+            f"No verdict on those that differ from {best} on fewer than {LEAST_DIFFERING} {unit}: "
             f"{', '.join(few)}."
         )
     if barred:

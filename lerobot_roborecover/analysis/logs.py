@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
-from lerobot_roborecover.analysis.first_states import with_first_states
+from lerobot_roborecover.analysis.first_states import screening_remark, with_first_states
 from lerobot_roborecover.analysis.look_alikes import check_names
 from lerobot_roborecover.analysis.named_path import missing, split_named, split_runs
 from lerobot_roborecover.analysis.stats.arms import (
@@ -142,6 +142,7 @@ def read_study(logs: Sequence[str], platform: str | None = None) -> Study:
     _check_scenarios(kept, found)
     _check_options(kept)
     remarks += _revisions(kept, found)
+    remarks += screening_remark(found)
     remarks += _render_qualities(kept)
     remarks += _clocks(kept)
     remarks += _unknown_weights(kept)
@@ -298,7 +299,8 @@ def _render_qualities(rows: Sequence[TrialRow]) -> list[str]:
     (`platforms.env_options.chosen_quality`)."""
     users: dict[str, str] = {}
     for row in _apart(rows, "options"):
-        users.setdefault(str(row.options.get("render_quality", "full")), row.policy)
+        if row.options.get("obs_type") != "state":
+            users.setdefault(str(row.options.get("render_quality", "full")), row.policy)
     users.pop("none", None)
     if len(users) < 2:
         return []

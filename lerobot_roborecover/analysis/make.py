@@ -21,6 +21,7 @@ from lerobot_roborecover.analysis.policy_tables import in_short
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.utils.outputs import check_page
+from lerobot_roborecover.utils.text import pluralize
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,11 @@ def _pictures(gallery: Gallery, out: Path, results: Results) -> tuple[dict, dict
             s.id: s.fingerprint.frames_png[-1] for s in wanted if s.fingerprint and s.fingerprint.frames_png
         }
         todo = [s for s in wanted if s.id not in frames]
+        if not gallery.render and todo:
+            remarks.append(
+                f"{pluralize(len(todo), 'scenario')} of {gallery.scenarios} have no recovery frame: --render "
+                "draws them"
+            )
         if gallery.render and todo:
             from lerobot_roborecover.analysis.pages.pictures import render_frames
 

@@ -47,9 +47,11 @@ def all_tables(results: Results) -> list[Table]:
         tables += runs_tables(results)
     if len(results.recovery.arms) > 1:
         tables.append(paired_contrasts(results))
-        tables.append(profiles(results))
-    if len(results.matched) > 1:
+        if (results.recovery.trials > 1).any():
+            tables.append(profiles(results))
+    if len(results.matched) > 2:
         tables.append(ranks(results))
+    if len(results.matched) > 1:
         tables += [table for table in [inversions(results)] if table.rows]
     tables += [grouped(results, *axis) for axis in _AXES]
     tables += [table for table in [by_prefix(results)] if table.rows]

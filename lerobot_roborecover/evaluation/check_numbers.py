@@ -80,7 +80,11 @@ def check_states(states: np.ndarray, stats: Stats | None, platform: str) -> Chec
         return ok(name, "not checked: the checkpoint has no statistics of states of this width")
     outside = _outside(states, *limits).mean(0) > 0.5
     if not outside.any():
-        return ok(name, f"all {states.shape[1]} values of observation.state within half a range of theirs")
+        return ok(
+            name,
+            f"all {states.shape[1]} values of observation.state within half a range of theirs; no other "
+            "state is compared",
+        )
     dims = np.flatnonzero(outside)
     low, high = limits
     shown = ", ".join(

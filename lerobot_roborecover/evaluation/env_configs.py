@@ -60,8 +60,11 @@ class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
         """Whether a policy sees any."""
         return any(feature.type is FeatureType.VISUAL for feature in self.features.values())
 
-    def run_spec(self) -> SimulatorSpec:
+    def run_spec(self, *, with_videos: bool = False) -> SimulatorSpec:
         """The platform's part of a run, checked.
+
+        Args:
+            with_videos: the run keeps videos.
 
         Raises:
             OptionError: an option cannot be used.
@@ -75,7 +78,7 @@ class RecoveryEnvConfig(RecoveryOptions, _PlatformsOwn):
         setup = self.simulator_setup()
         slot = SlotConfig(
             setup.platform or self.platform_name,
-            dict(setup.options),
+            {**setup.options, **(setup.video_options if with_videos else {})},
             approximate_snapshots=setup.approximate_snapshots,
             control_mode=setup.control_mode,
         )

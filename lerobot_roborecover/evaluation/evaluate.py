@@ -145,7 +145,12 @@ def evaluate(
             make_host = partial(_host, spec, policy, *own) if own else partial(load_host, spec)
             device, remedy = str(config.device), remedy_of(spec)
         chosen, run = create_session(
-            options, options.run_spec(), workers=True, facts=facts, scenarios=chosen, run_seed=seed
+            options,
+            options.run_spec(with_videos=kept > 0),
+            workers=True,
+            facts=facts,
+            scenarios=chosen,
+            run_seed=seed,
         )
         with run:
             counts = RunProgress(run.protocol.start, chosen.ids, trials)

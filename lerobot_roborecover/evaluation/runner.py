@@ -63,10 +63,9 @@ class RunnerOptions:
     videos: int | None = None
     """MP4s to keep under `videos/` in the output directory, at most (default: 4 where the environment renders
     images, else 0)."""
-    videos_of: str = ""
-    """Of which trials: `failures` (default with a number of videos), `successes`, `all`, comma-separated
-    scenario ids, or `sample` (default without): the first trial of scenarios spread over the set, the same
-    ones for every policy."""
+    videos_of: str = "sample"
+    """Of which trials: `sample`, the first trial of scenarios spread over the set, the same ones for every
+    policy; or `failures`, `successes`, `all`, comma-separated scenario ids."""
     render_device: str = "auto"
     """Where simulators draw: `auto` (the policy's GPU; on a Ray cluster the GPUs of a simulator's own
     machine, in turn), `cpu`, or a GPU's number."""
@@ -218,9 +217,11 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
         n_episodes=cfg.eval.n_episodes,
         output_dir=out,
     )
-    scenarios, run = create_session(env, env.run_spec(), workers=True, facts=facts, run_seed=cfg.seed)
+    spec = env.run_spec(with_videos=_video_count(cfg) > 0)
+    scenarios, run = create_session(env, spec, workers=True, facts=facts, run_seed=cfg.seed)
     with run:
         log = run.require_log()
+        _check_same_options(run)
         if not run.rows():
             check_eval_info(out / "eval_info.json", log)
         if cfg.runner.retried:
@@ -233,6 +234,31 @@ def evaluate(cfg: RecoveryEvalConfig) -> int:
             return _run(cfg, run, scenarios, stop)
         finally:
             stop.restore()
+
+
+def _check_same_options(run: EvalSession) -> None:
+    """Checks that a log has no rows of this policy and start under other options of the environment: a report
+    could not tell them apart.
+
+    Raises:
+        OptionError: it has; names the options.
+    """
+    log, mine = run.require_log(), run.protocol
+    for row in log.rows:
+        if (row.policy, row.start, row.rewind_steps) != (mine.policy, mine.start, mine.rewind_steps):
+            continue
+        names = sorted(
+            name for name in {*row.options, *mine.options} if row.options.get(name) != mine.options.get(name)
+        )
+        if names:
+            told = ", ".join(
+                f"{name} is {mine.options.get(name)!r} here and {row.options.get(name)!r} there"
+                for name in names[:3]
+            )
+            raise OptionError(
+                f"{log.path} has trials of this policy under other options: {told}. Give this run another "
+                "--output_dir (or --env.trial_log), or the same options"
+            )
 
 
 def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop: StopCondition) -> int:
@@ -259,8 +285,7 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
 
     videos, result = None, RunResult()
     if count := _video_count(cfg):
-        of = cfg.runner.videos_of or ("sample" if cfg.runner.videos is None else "failures")
-        videos = VideoRecorder(out / "videos", count, of, ids, Start(run.protocol.start))
+        videos = VideoRecorder(out / "videos", count, cfg.runner.videos_of, ids, Start(run.protocol.start))
     if watch is not None:
         watch.record(log.path)
     if not settled():

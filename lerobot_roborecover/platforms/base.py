@@ -57,6 +57,8 @@ class SimulatorSetup:
     """Use snapshots also where what follows them drifts from a replay."""
     platform: str = ""
     """Name of the platform, where the env type serves several."""
+    video_options: Mapping[str, Any] = field(default_factory=dict)
+    """Options in place of those above where pictures are drawn for videos alone."""
 
 
 class VideoEnvMixin:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -67,6 +67,15 @@ def check_quality(quality: str) -> None:
 def chosen_quality(quality: str) -> dict[str, str]:
     """Left out where it is LeRobot's: trials from before there was a choice keep their identity."""
     return {} if quality == "full" else {"render_quality": quality}
+
+
+FAST_PICTURES = {"render_quality": "fast"}
+"""Of a run whose policy sees no pictures: its videos are for people."""
+
+
+def without_quality(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a run whose policy sees no pictures: what its videos look like decides nothing."""
+    return {name: value for name, value in options.items() if name != "render_quality"}
 
 
 def drop_pictures(config: EnvConfig) -> None:

@@ -116,14 +116,12 @@ def test_a_policy_without_a_valid_trial_is_not_worse(tmp_path):
     results = analyse(study, QUICK)
     assert results.contrast("a", "b").verdict is ComparisonVerdict.NO_VALID_TRIAL
     text = headline(results)
-    assert text.startswith("b succeeds from")
+    assert text.startswith("Success of b:")
     assert "No trial of a was valid (40 state_mismatch)" in text
     assert "separated" not in text
     never = [trial_row(n, k, False, policy="c") for n in range(20) for k in range(2)]
     results = analyse(study_of(tmp_path / "never", a=mismatched("a"), c=never), QUICK)
-    assert headline(results).startswith("c succeeds from recovery points in 0.0 % of trials"), (
-        "its trials are valid"
-    )
+    assert headline(results).startswith("Success of c: 0.0 % from recovery points"), "its trials are valid"
 
 
 def test_the_notes_say_what_sign_flips_test(tmp_path):

@@ -62,7 +62,8 @@
     const lines = [];
     const wide = width();
     const rounded = (value) => Number(value.toPrecision(2));
-    if (trial.progress) lines.push(["progress", "0 to 100 %", trial.progress, 100, 60]);
+    // Where a task tells success alone, a curve would say that nothing moved.
+    if (trial.progress && trial.progress.some((done) => done > 0 && done < 100)) lines.push(["progress", "0 to 100 %", trial.progress, 100, 60]);
     if (trial.actions) {
       trial.actions.levels.forEach((values, k) => lines.push(
         [trial.actions.names[k], rounded(trial.actions.low[k]) + " to " + rounded(trial.actions.high[k]), values, 99, 34]));

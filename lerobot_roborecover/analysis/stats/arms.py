@@ -171,7 +171,7 @@ def stopped(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> tuple[A
 def _differences(first: TrialRow, second: TrialRow) -> str:
     fields = ("run_seed", "execution_horizon", "versions", "options")
     found = [
-        f"{f} ({getattr(first, f)} / {getattr(second, f)})"
+        f"{f} ({' / '.join(_apart(getattr(first, f), getattr(second, f)))})"
         for f in fields
         if getattr(first, f) != getattr(second, f)
     ]
@@ -179,6 +179,15 @@ def _differences(first: TrialRow, second: TrialRow) -> str:
         differences = settings_differences(first.policy_settings or {}, second.policy_settings or {})
         found.append(f"the policy's settings ({differences})")
     return ", ".join(found) or "the evaluation's options (see the rows' config_hash)"
+
+
+def _apart(one: object, other: object) -> tuple[str, str]:
+    """Both values; of mappings what differs, alone."""
+    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
+        return str(one), str(other)
+    names = sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
+    told = [", ".join(f"{n} {of.get(n, 'not said')}" for n in names) for of in (one, other)]
+    return told[0], told[1]
 
 
 def sequential_remarks(arms: Sequence[Arm], records: Sequence[SequentialRecord]) -> list[str]:

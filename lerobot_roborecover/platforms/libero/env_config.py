@@ -14,12 +14,14 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
 from lerobot_roborecover.platforms.env_options import (
+    FAST_PICTURES,
     check_quality,
     chosen_quality,
     drop_pictures,
     first_camera,
     no_video,
     refuse_unused,
+    without_quality,
 )
 from lerobot_roborecover.platforms.libero.goal_state import ENVIRONMENT_STATE_DIM
 
@@ -39,7 +41,8 @@ class LiberoConfig(LiberoEnv, VideoEnvMixin):
     render_quality: str = "full"
     """`full`, as LeRobot renders; or `fast`, without shadows, reflections and smoothing and with coarser
     meshes, at a tenth of the cost or so where there is no GPU. Other pictures, so another experiment for a
-    policy that looks at them; the physics is the same."""
+    policy that looks at them; the physics is the same. Videos that `roborecover eval` keeps of one that does
+    not are always `fast`."""
 
     def processors_for(self, policy_cfg: PreTrainedConfig) -> None:
         """LeRobot's choice is right here."""
@@ -89,15 +92,17 @@ class LiberoConfig(LiberoEnv, VideoEnvMixin):
         decisive = {k: v for k, v in options.items() if k != "assets_dir"}
         if self.render_quality == "fast" and self.obs_type != "state":
             decisive["fast_pictures"] = _FAST_PICTURES
-        picture = _upright
+        picture, for_videos = _upright, {}
         if self.obs_type == "state":
             picture = None if self.videos else no_video
+            decisive, for_videos = without_quality(decisive), FAST_PICTURES
         return SimulatorSetup(
             options,
             decisive | {"control_mode": self.control_mode},
             picture,
             assets={"libero_assets": physics_hash(assets)},
             control_mode=self.control_mode,
+            video_options=for_videos,
         )
 
 

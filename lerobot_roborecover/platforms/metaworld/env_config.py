@@ -10,11 +10,13 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
 
 from lerobot_roborecover.platforms.base import SimulatorSetup, VideoEnvMixin
 from lerobot_roborecover.platforms.env_options import (
+    FAST_PICTURES,
     check_quality,
     chosen_quality,
     first_camera,
     no_video,
     refuse_unused,
+    without_quality,
 )
 
 
@@ -26,7 +28,8 @@ class MetaworldConfig(MetaworldEnv, VideoEnvMixin):
     observation_width: int = 480
     render_quality: str = "full"
     """`full`, as LeRobot renders; or `fast`, without shadows and smoothing, some six times as fast where
-    there is no GPU. Other pictures, so another experiment for a policy that looks at them."""
+    there is no GPU. Other pictures, so another experiment for a policy that looks at them; videos that
+    `roborecover eval` keeps of one that does not are always `fast`."""
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(4,))}
     )
@@ -69,6 +72,8 @@ class MetaworldConfig(MetaworldEnv, VideoEnvMixin):
         refuse_unused(self, MetaworldEnv)
         check_quality(self.render_quality)
         picture = first_camera
+        decisive, for_videos = self.gym_kwargs, {}
         if self.obs_type == "state":
             picture = None if self.videos else no_video
-        return SimulatorSetup(self.gym_kwargs, self.gym_kwargs, picture)
+            decisive, for_videos = without_quality(decisive), FAST_PICTURES
+        return SimulatorSetup(self.gym_kwargs, decisive, picture, video_options=for_videos)
