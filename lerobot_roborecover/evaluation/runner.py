@@ -43,6 +43,7 @@ from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import Backend
 
 logger = logging.getLogger(__name__)
+WORDS = {Start.RECOVERY: "recovery points", Start.INITIAL: "initial states"}
 
 
 @dataclass
@@ -323,22 +324,22 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
 
 
 def _say_next(cfg: RecoveryEvalConfig, log: Path) -> int:
-    """Names the command that reports a finished run, and how to add the other start; not for a shard, or
-    where another command runs this one."""
+    """Names the commands that report a finished run, and run the other start; not for a shard, or where
+    another command runs this one."""
     out, (_, shards) = cfg.folder, cfg.recovery_env.shard_of()
-    if NESTED not in os.environ and shards == 1:
-        logged = str(out if log == out / "trials.jsonl" else log)
-        start = Start(cfg.recovery_env.start)
-        if start is Start.INITIAL:
-            logged = f"RECOVERY_RUN,{logged}"
-        print(next_command(["report", logged, "--out", str(out / "report")]))
-        if start is Start.INITIAL:
-            print("RECOVERY_RUN is the --output_dir of the same command with --env.start=recovery")
-        elif start is Start.RECOVERY:
-            print(
-                f"with its rate from initial states: the same command with --env.start=initial and another "
-                f"--output_dir, OTHER; then report {logged},OTHER"
-            )
+    if NESTED in os.environ or shards != 1:
+        return 0
+    logged = str(out if log == out / "trials.jsonl" else log)
+    start, report = Start(cfg.recovery_env.start), str(out / "report")
+    print(next_command(["report", logged, "--out", report]))
+    if start is not Start.REVERSION:
+        other = Start.RECOVERY if start is Start.INITIAL else Start.INITIAL
+        beside = f"{out}-{other.value}"
+        set_here = ("--env.start=", "--output_dir=", "--env.trial_log=")
+        words = [word for word in sys.argv[1:] if not word.startswith(set_here)]
+        again = ["eval", *words, f"--env.start={other.value}", f"--output_dir={beside}"]
+        print(next_command(again, f"or first, from {WORDS[other]}"))
+        print(next_command(["report", logged, beside, "--out", report], "then"))
     return 0
 
 

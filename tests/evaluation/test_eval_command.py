@@ -98,14 +98,19 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert "Recovery success (RSR)" in shown
     named = f"next: roborecover report {out} --out {out / 'report'}"
-    assert shown.splitlines()[-2] == named
-    assert "the same command with --env.start=initial" in shown.splitlines()[-1]
+    assert shown.splitlines()[-3] == named
+    again, both = (shlex.split(line.partition(": roborecover ")[2]) for line in shown.splitlines()[-2:])
+    assert {"--env.start=initial", f"--output_dir={out}-initial"} <= set(again)
     assert "Loading weights" not in shown
     monkeypatch.setenv(NESTED, "1")
     run()
     assert "next: " not in capsys.readouterr().out, "the outer command says what comes next"
     assert main(shlex.split(named)[2:]) == 0
     assert (out / "report" / "report.html").exists()
+    assert main(again) == 0
+    assert {r.start for r in rows_of(Path(f"{out}-initial"))} == {"initial"}
+    assert main(both) == 0
+    assert "from initial states" in capsys.readouterr().out
 
 
 def test_real_time_is_the_same_under_lerobot_eval(run, whole, dataset, policy, tmp_path):
