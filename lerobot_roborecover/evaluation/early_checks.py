@@ -231,7 +231,8 @@ class CommandLine:
             OptionError: naming the checkpoint, and both widths.
         """
         name = platform_of(self.env_type)
-        if self.env_type == WRAPPED or name not in platform_names() or platform_named(name).env_name:
+        wrapped = name == platform_of(WRAPPED)  # any environment of LeRobot's, with actions of its own
+        if wrapped or name not in platform_names() or platform_named(name).env_name:
             return
         widths = platform_named(name).action_widths
         for label, config in self._checkpoints.items():

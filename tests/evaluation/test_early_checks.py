@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_roborecover.cli.config_command import EVAL, help_text
-from lerobot_roborecover.evaluation.early_checks import env_class, join_values, policy_types
+from lerobot_roborecover.evaluation.early_checks import CommandLine, env_class, join_values, policy_types
 from lerobot_roborecover.platforms.env_options import NOT_OPTIONS
 from lerobot_roborecover.utils.config_source import read_class
 from tests.support.processes import PATIENCE_S
@@ -101,6 +101,13 @@ def test_refusals_are_one_line_and_import_neither_lerobot_nor_torch():
         (line,) = told.splitlines()
         assert line.startswith("roborecover "), argv
         assert said in line, argv
+
+
+@pytest.mark.parametrize("kind", ["roborecover_wrapped", "roborecover_lerobot", "roborecover_metaworld"])
+def test_a_checkpoint_fits_its_own_platform_and_any_wrapped_environment(kind):
+    line = CommandLine(EVAL.source, [f"--env.type={kind}", f"--policy.path={POLICY}"])
+    line.check()
+    line.check_action_widths()
 
 
 def test_values_may_stand_behind_a_space():
