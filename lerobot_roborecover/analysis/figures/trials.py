@@ -70,7 +70,7 @@ def oracle_bars(results: Results) -> style.Figure:
     ]
     if not math.isnan(found.rate.value):
         bars.append(("best of each scenario, cross-fitted", found.rate, style.PAPER))
-    bars.append(("the same, in hindsight", found.hindsight, style.PAPER))
+    bars.append(("best of each, in hindsight", found.hindsight, style.PAPER))
 
     def draw(width: style.Width) -> style.Plot:
         with style.drawing() as subplots:
