@@ -291,10 +291,10 @@ def _estimate(
         ok("inference time", value),
         ok(
             "run time",
-            f"at most {_time(total)} beside LeRobot's own start on {slots} slots for {len(scenarios)} "
-            f"scenarios x {pluralize(cfg.eval.n_episodes, 'trial')} from one start ({_time(policy_s)} of the "
-            f"policy, {_time(sim_s)} of the simulators; {busy} will be the slower), if every trial ran to "
-            f"its last step. From {len(steps.actions)} steps on this machine",
+            f"at most {_time(total)} beside LeRobot's own start and videos, on {slots} slots for "
+            f"{len(scenarios)} scenarios x {pluralize(cfg.eval.n_episodes, 'trial')} from one start "
+            f"({_time(policy_s)} of the policy, {_time(sim_s)} of the simulators; {busy} is the slower), "
+            f"if every trial ran to its last step. From {len(steps.actions)} steps on this machine",
         ),
     ]
 
