@@ -104,7 +104,7 @@ def _intervals(results: Results, best: int, rate: Estimate) -> str:
         draws = results.tasks.part(np.array(results.compared.scenarios, int))
         (tasks,) = draws.rates(results.ranked.rates[[best]].T)
         if not math.isnan(tasks.low):
-            return f"{text}). The interval for other tasks than these {draws.units} is {_bounds(tasks)}"
+            return f"{text}). Recovery in other tasks than these {draws.units}: {_bounds(tasks)} %"
     return text + ")"
 
 

@@ -43,7 +43,8 @@ from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import Backend
 
 logger = logging.getLogger(__name__)
-WORDS = {Start.RECOVERY: "recovery points", Start.INITIAL: "initial states"}
+_BESIDE = "-initial"
+"""What the folder of the initial trials is called, beside that of a recovery run."""
 
 
 @dataclass
@@ -331,15 +332,18 @@ def _say_next(cfg: RecoveryEvalConfig, log: Path) -> int:
         return 0
     logged = str(out if log == out / "trials.jsonl" else log)
     start, report = Start(cfg.recovery_env.start), str(out / "report")
-    print(next_command(["report", logged, "--out", report]))
-    if start is not Start.REVERSION:
-        other = Start.RECOVERY if start is Start.INITIAL else Start.INITIAL
-        beside = f"{out}-{other.value}"
+    recovery = str(out).removesuffix(_BESIDE)
+    if start is Start.INITIAL and recovery != str(out) and Path(recovery, "trials.jsonl").exists():
+        logs = [recovery, logged]  # as the run before has named it
+    else:
+        logs = [logged]
+    print(next_command(["report", *logs, "--out", report]))
+    if start is Start.RECOVERY:
         set_here = ("--env.start=", "--output_dir=", "--env.trial_log=")
         words = [word for word in sys.argv[1:] if not word.startswith(set_here)]
-        again = ["eval", *words, f"--env.start={other.value}", f"--output_dir={beside}"]
-        print(next_command(again, f"or first, from {WORDS[other]}"))
-        print(next_command(["report", logged, beside, "--out", report], "then"))
+        again = ["eval", *words, f"--env.start={Start.INITIAL.value}", f"--output_dir={out}{_BESIDE}"]
+        print(next_command(again, "or first, from initial states"))
+        print(next_command(["report", logged, f"{out}{_BESIDE}", "--out", report], "then"))
     return 0
 
 

@@ -251,7 +251,7 @@ class TrialLog:
     def other_rows(self, protocol: EvalProtocol) -> list[str]:
         """Returns a line for each kind of rows of this policy and start that a run of the protocol does not
         reuse, or reuses although nothing says whose they are."""
-        other = earlier = unnamed = replaced = 0
+        other = earlier = unnamed = replaced = unidentified = 0
         own, versions = _version(protocol.policy_settings), set()
         for kind, count in self._kinds.items():
             if (kind.policy, kind.start) != (_nameless(protocol.policy), protocol.start):
@@ -265,12 +265,20 @@ class TrialLog:
                 other += count
             elif protocol.policy == "unknown":
                 unnamed += count
+            elif protocol.policy_settings.get("server_weights") == "not known":
+                unidentified += count
         found = []
         if unnamed:
             found.append(
                 f"nothing says which policy this run has: {unnamed} row(s) in {self.path}, of a run that did "
                 "not say it either, are taken for its own. Give each policy a log of its own "
                 "(--env.trial_log)"
+            )
+        if unidentified:
+            found.append(
+                f"the policy server has no identity: {unidentified} row(s) of {protocol.policy} in "
+                f"{self.path} are taken for its own, whatever has changed. Have the server tell an "
+                "`identity`, or give a changed one another --policy.name"
             )
         if replaced:
             found.append(

@@ -270,7 +270,7 @@ def test_commands_say_the_same(tmp_path, capsys):
     said = json.loads((tmp_path / "out" / "results.json").read_text())
     assert capsys.readouterr().out.startswith(said["headline"])
     assert re.search(
-        r"over 60 scenarios\)\. The interval for other tasks than these 10 is [\d.]+ to [\d.]+\.",
+        r"over 60 scenarios\)\. Recovery in other tasks than these 10: [\d.]+ to [\d.]+ %\.",
         said["headline"],
     )
     table = said["tables"]["contrasts"]

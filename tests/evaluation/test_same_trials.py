@@ -121,6 +121,9 @@ def test_a_corrected_mapping_and_another_server(run, tmp_path):
     with _server() as url:
         rows, printed = run(*remote, url)
         assert rows[0].policy_settings["server_weights"] == "not known"
+        rows, printed = run(*remote, url)
+        assert len(rows) == COUNT
+        assert f"no identity: {COUNT} row(s) of mine in" in printed
         mapping.write_text(MAPPING)
         rows, printed = run(*remote, url)
     assert len(rows) == 2 * COUNT

@@ -41,7 +41,7 @@ JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
 _PACE = ("engine", "ray_address", "replicas", "num_workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
-_ADDED = {"early_stop", "min_per_split"}
+_ADDED = {"early_stop", "min_per_split", "unscreened"}
 """Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 
@@ -334,7 +334,7 @@ def _options(part: Any) -> Any:
 
     given = asdict(part).items()
     stored = {new: old for old, new in OLD_KEYS.items()}  # names in the records of earlier builds
-    found = {stored.get(k, k): v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
+    found = {stored.get(k, k): v for k, v in given if k not in _PACE and not (k in _ADDED and not v)}
     if found.get("policy"):
         found["policy"] = policy_identity(found["policy"])
     for policy in found.get("policies", ()):
