@@ -334,7 +334,7 @@ def _options(part: Any) -> Any:
 
     given = asdict(part).items()
     stored = {new: old for old, new in OLD_KEYS.items()}  # names in the records of earlier builds
-    found = {stored.get(k, k): v for k, v in given if k not in _PACE and not (k in _ADDED and not v)}
+    found = {stored.get(k, k): v for k, v in given if k not in _PACE and not (k in _ADDED and v is None)}
     if found.get("policy"):
         found["policy"] = policy_identity(found["policy"])
     for policy in found.get("policies", ()):
