@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -240,7 +241,7 @@ def _value(one: SourceField) -> str:
 def _default(one: SourceField) -> str:
     """A default that is a plain value, as it is typed; empty where the docstring says it."""
     try:
-        value = ast.literal_eval(one.default)
+        value = ast.literal_eval(re.sub(r"^Path\((.*)\)$", r"\1", one.default))
     except (ValueError, SyntaxError):
         return ""
     if value in ("", None) or "default" in one.doc.lower():

@@ -80,7 +80,7 @@ def read_class(module: str, name: str) -> SourceClass | None:
 def nested_class(one: SourceField) -> SourceClass | None:
     """Returns the dataclass that is a field's type; None where it is something else."""
     name = re.sub(r"\s*\|\s*None$", "", one.kind)
-    if not re.fullmatch(r"[\w.]+", name):
+    if not re.fullmatch(r"[\w.]+", name) or name.rpartition(".")[2] == "Path":
         return None
     return read_class(one.module, name.rpartition(".")[2])
 

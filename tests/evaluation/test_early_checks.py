@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_roborecover.cli.config_command import EVAL, help_text
+from lerobot_roborecover.cli.config_command import EVAL, RUN_PLAN, help_text
 from lerobot_roborecover.evaluation.early_checks import CommandLine, env_class, join_values, policy_types
 from lerobot_roborecover.platforms.env_options import NOT_OPTIONS
 from lerobot_roborecover.utils.config_source import read_class
@@ -129,6 +129,13 @@ def test_help_has_a_sentence_for_every_option_of_an_environment(platform):
     assert not missing
     assert "--policy.path" in shown
     assert not [name for name, doc in shown.items() if "." in name and len(doc.split()) < 3]
+
+
+def test_help_shows_paths_with_their_defaults():
+    text = help_text(RUN_PLAN.source, "", [])
+    assert "--plan=PATH\n      Points, policies, repeats and seed (plan.yaml)" in text
+    assert "--out=PATH" in text
+    assert "--tls_key=PATH" in text
 
 
 def test_help_with_a_policy_shows_its_options():
