@@ -35,7 +35,7 @@ def made(tmp_path_factory):
 
     root = tmp_path_factory.mktemp("robot")
     scripted(root / "good", size=48)
-    scripted(root / "worse", size=48, bias_mm=60.0)
+    scripted(root / "worse", size=48, bias_mm=200.0)
     with lab(root) as robot:
         context = load_context(robot, str(root / "worse"), fps=FPS, instruction=robot.instruction)
         found = capture(
@@ -60,7 +60,8 @@ def plan_of(made, **changes):
         "policies": {"good": {"path": str(made / "good")}, "worse": {"path": str(made / "worse")}},
         "repeats": 1,
         "seed": 3,
-        "tolerance": {"joint": 4.0, "object_px": 1.5, "background_px": 1.5},
+        # At 48 pixels a puck is two or three: how alike they look says little.
+        "tolerance": {"joint": 4.0, "object_px": 1.5, "background_px": 1.5, "similarity": 0.5},
         "motion": {"speed": 300.0, "tolerance": 2.0, "max_lag": 250.0, "max_detour": 50.0},
     }
     return parse_plan({**values, **changes})
@@ -130,12 +131,12 @@ def test_a_plan_is_run_blind_and_resumed_and_its_log_is_a_study(made, tmp_path):
         assert trial.rater == "kim"
         assert trial.reset_s > 0
         assert abs(trial.start_error.worst("joint")) <= 4.0
-        if row.outcome in ("success", "horizon"):
-            assert not trial.start_error.problems
-            assert trial.episode is not None
+        assert row.outcome in ("success", "horizon"), row.reason
+        assert not trial.start_error.problems
+        assert trial.episode is not None
     good = [r.success for r in rows if r.options["policy_name"] == "good"]
     worse = [r.success for r in rows if r.options["policy_name"] == "worse"]
-    assert sum(good) > sum(worse)
+    assert (good, worse) == ([True, True], [False, False])
     results = analyse(read_study([str(tmp_path / "trials.jsonl")]))
     assert len(results.recovery.arms) == 2
     told = said_by_dataset(tmp_path)
