@@ -19,6 +19,7 @@ from lerobot_roborecover.analysis.pages.media import find_clips, videos_beside
 from lerobot_roborecover.analysis.pages.report import REPORT_FILES, Extras, ReportFiles, write_report
 from lerobot_roborecover.analysis.policy_tables import in_short
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import of_robots, starts_in_short
 from lerobot_roborecover.analysis.tables import to_text
 from lerobot_roborecover.utils.outputs import check_page
 from lerobot_roborecover.utils.text import pluralize
@@ -37,7 +38,10 @@ class Report:
 
     def text(self) -> str:
         """Its headline, the table of all policies, and where the files are."""
-        overall = to_text(in_short(next(table for table in self.files.tables if table.name == "overall")))
+        table, robots = next(t for t in self.files.tables if t.name == "overall"), of_robots(self.results)
+        overall = to_text(in_short(table, robots))
+        if robots:
+            overall += f"\nStart errors, medians\n{to_text(starts_in_short(self.results))}"
         out = self.files.html.parent
         return (
             f"{headline(self.results)}\n\n{overall}\n\nreport    {self.files.html}\nmarkdown  "

@@ -66,12 +66,17 @@ def detectable_table(
         Column("Trials per scenario", "count"), Column("Trials of one policy", "count"),
         Column("Least difference", "points"),
     )  # fmt: skip
+    hopeless = [str(row[0]) for row in rows if math.isnan(row[2])]
+    none = (
+        f"None at {', '.join(hopeless)} trials per scenario: the other policy would have to solve more than "
+        "everything. More scenarios are needed."
+    )
     return Table(
         "detectable",
         f"Least difference that {scenarios} scenarios separate with {100 * wanted:g} % chance, in points",
         columns,
         tuple(rows),
-        (_believed(guess), _tested(level, family)),
+        (*((none,) if hopeless else ()), _believed(guess), _tested(level, family)),
     )
 
 

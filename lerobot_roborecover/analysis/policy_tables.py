@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import of_robots
 from lerobot_roborecover.analysis.stats.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.stats.macro import (
     MACRO_9,
@@ -74,16 +75,29 @@ def overall(results: Results) -> Table:
         f"they speak of {ESTIMAND[panel.unit(results.options.cluster)]}. {_of_tasks(results)}Percentile "
         f"bootstrap, as in the paper: {draws.draws} draws, seed {draws.seed}, to compare with the paper.",
         *(f"Incomplete: {arm.title}: {arm.missing.words}." for arm in results.arms if arm.missing),
-        *cells.notes(results.unit),
+        *(() if of_robots(results) else cells.notes(results.unit)),
     )
     return Table("overall", "Overall results", columns, tuple(rows), notes)
 
 
-def in_short(table: Table) -> Table:
-    """The overall table as a terminal shows it: up to the invalid trials, without definitions."""
-    width = [column.title for column in table.columns].index("Invalid") + 1
-    rows = tuple(row[:width] for row in table.rows)
-    return replace(table, columns=table.columns[:width], rows=rows, notes=table.notes[_DEFINITIONS:])
+def in_short(table: Table, robots: bool = False) -> Table:
+    """The overall table as a terminal shows it: up to the invalid trials, without definitions.
+
+    Args:
+        table: by `overall`.
+        robots: of trials on robots, which have recovery points alone, and cells of their own.
+    """
+    titles = [column.title for column in table.columns]
+    kept = [
+        i
+        for i, title in enumerate(titles[: titles.index("Invalid") + 1])
+        if not (robots and title.startswith(("Initial", "Macro", "Retention")))
+    ]
+    columns, rows = (
+        tuple(table.columns[i] for i in kept),
+        [tuple(row[i] for i in kept) for row in table.rows],
+    )
+    return replace(table, columns=columns, rows=tuple(rows), notes=table.notes[_DEFINITIONS:])
 
 
 def _scenarios(results: Results, p: int) -> str | int:

@@ -3,20 +3,68 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.second_rater import FOLDER, LOG_FILE, agreement_of
 from lerobot_roborecover.analysis.stats.start_error import MEASURES, summary, verdict_slope
 from lerobot_roborecover.analysis.tables import Column, Table
 
 _MIN_SECONDS = 60.0
+_OVERALL = ("Trials", "Successes %")
+_SHORT = {"Not run: start too far off": "Not run", "Minutes a reset": "Reset, min"}
 
 
 def robot_tables(results: Results) -> list[Table]:
-    """Both tables; none of simulated trials."""
-    rows = [row for arm in results.study.arms for row in arm.rows]
-    if not any(row.robot is not None for row in rows):
+    """Starts, verdicts against start errors, and second raters where there are any; none of simulated
+    trials."""
+    if not of_robots(results):
         return []
-    return [starts(results), slopes(results)]
+    raters = second_raters(results)
+    return [starts(results), slopes(results), *([raters] if raters.rows else [])]
+
+
+def of_robots(results: Results) -> bool:
+    """Whether any trial was on a robot."""
+    return any(row.robot is not None for arm in results.study.arms for row in arm.rows)
+
+
+def starts_in_short(results: Results) -> Table:
+    """The medians of the start errors, for a terminal."""
+    table = starts(results)
+    kept = [
+        i for i, c in enumerate(table.columns) if not c.title.endswith("90 %") and c.title not in _OVERALL
+    ]
+    return replace(
+        table,
+        title="",
+        columns=tuple(
+            replace(table.columns[i], title=_SHORT.get(table.columns[i].title, table.columns[i].title))
+            for i in kept
+        ),
+        rows=tuple(tuple(row[i] for i in kept) for row in table.rows),
+        notes=(),
+    )
+
+
+def second_raters(results: Results) -> Table:
+    """How verdicts of second raters go with the first ones."""
+    logs = [log for log in results.study.logs if log.name == LOG_FILE]
+    folders = sorted({log.parent for log in logs if (log.parent / FOLDER).is_dir()})
+    rows = [
+        (rater, count, share, kappa)
+        for folder in folders
+        for rater, (count, share, kappa) in agreement_of(folder).items()
+    ]
+    columns = (
+        Column("Second rater"), Column("Trials", "count"), Column("Alike %", "percent"),
+        Column("Cohen's kappa", "ratio"),
+    )  # fmt: skip
+    notes = (
+        "Verdicts from the recordings, given blind, against those given at the robot. Kappa: agreement "
+        "beyond chance; not defined where a rater gave one verdict alone. No rate of this report uses them.",
+    )
+    return Table("robot_raters", "Agreement of raters", columns, tuple(rows), notes)
 
 
 def starts(results: Results) -> Table:
@@ -47,11 +95,16 @@ def starts(results: Results) -> Table:
 def slopes(results: Results) -> Table:
     """Verdict against start error."""
     rows = [row for arm in results.study.arms for row in arm.rows]
-    found = tuple((words, verdict_slope(rows, name, results.draws.level)) for name, words in MEASURES)
+    slopes = {words: verdict_slope(rows, name, results.draws.level) for name, words in MEASURES}
+    found = tuple((words, s.trials, s.estimate, s.reason) for words, s in slopes.items())
     notes = (
         "Logistic regression of the verdict on the start error, with an intercept for each policy: change of "
-        "the log-odds of success per unit. An interval that holds 0 does not show that the starts mattered; "
-        "a wide one does not show that they did not.",
+        "the log-odds of success per unit. A policy whose verdicts are all alike says nothing of it. An "
+        "interval that holds 0 does not show that the starts mattered; a wide one does not show that they "
+        "did not.",
     )
-    columns = (Column("Start error"), Column("Log-odds per unit", "ratio"))
+    columns = (
+        Column("Start error"), Column("Trials", "count"), Column("Log-odds per unit", "ratio"),
+        Column("No number because"),
+    )  # fmt: skip
     return Table("robot_slopes", "Verdict against start error", columns, found, notes)

@@ -9,6 +9,7 @@ from typing import Any
 from lerobot_roborecover.robot.connection import RobotLostError
 from lerobot_roborecover.robot.console import Console
 from lerobot_roborecover.robot.recorder import Recorder
+from lerobot_roborecover.robot.restore import LivePictures
 from lerobot_roborecover.robot.suggestions import FailureWatch
 from lerobot_roborecover.utils.text import pluralize
 
@@ -51,18 +52,22 @@ def capture(
     fps = context.runtime.cfg.fps
     recorder = Recorder(folder, f"rollout_{folder.name}", robot, context.data.dataset_features, fps)
     marked = 0
+    if recorder.number:
+        say(f"{folder} has {pluralize(recorder.number, 'episode')}; new ones are added")
+    live_pictures = LivePictures(robot, console)
     for number in range(episodes):
         said = console.ask(
             "next",
             f"Episode {number + 1} of {episodes}: set the scene, then press Go.",
             ("go", "pause"),
             {"instruction": instruction},
+            live_pictures,
         )
         if said.button == "pause":
             break
         console.release()
-        if hasattr(robot, "new_scene") and number:
-            robot.new_scene()
+        if hasattr(robot, "new_scene"):
+            robot.new_scene(robot.config.seed + recorder.number)
         buttons = ("mark", "end", *(("takeover", "handback") if teleop else ()))
         console.show(
             "capturing", "Press Mark the moment that something has gone wrong and lies still.", buttons,

@@ -49,14 +49,14 @@ class Console:
         self._version = 0
         self._heard: float | None = None
         self.pictures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        """Recorded and live picture by camera, for the ghost."""
+        """Recorded and live picture by camera, of the present screen."""
 
     # --- the run's side
 
     def show(
         self, name: str, text: str = "", buttons: Sequence[str] = (), details: dict[str, Any] | None = None
     ) -> None:
-        """Shows a screen; answers to the one before are forgotten, a stop is not."""
+        """Shows a screen; answers to the one before and its pictures are forgotten, a stop is not."""
         with self._lock:
             self._screen = {
                 "name": name,
@@ -66,6 +66,7 @@ class Console:
             }
             self._version += 1
             self._answers.clear()
+            self.pictures = {}
             self._lock.notify_all()
 
     def ask(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,13 +10,37 @@ from typing import Any
 from lerobot_roborecover.logs.robot import StartError
 from lerobot_roborecover.robot.approach import MotionConfig, StoppedError, move_to
 from lerobot_roborecover.robot.clock import clock_of
-from lerobot_roborecover.robot.connection import check_point
+from lerobot_roborecover.robot.connection import RobotError, asking, camera_names, check_point
 from lerobot_roborecover.robot.console import Console
 from lerobot_roborecover.robot.points import PointSet, RobotPoint
 from lerobot_roborecover.robot.start_check import StartCheck, Tolerance
 
 _LIVE_S = 0.4
 """Seconds between two measurements while a person puts things back."""
+
+
+class LivePictures:
+    """Renews the console's pictures from a robot's cameras while a person is asked.
+
+    Args:
+        robot: connected. One that does not answer leaves the question without pictures.
+        console: shows them.
+    """
+
+    def __init__(self, robot: Any, console: Console):
+        self._robot, self._console, self._last = robot, console, float("-inf")
+
+    def __call__(self) -> None:
+        if time.monotonic() - self._last < _LIVE_S:
+            return
+        try:
+            with asking(self._robot):
+                observation = self._robot.get_observation()
+        except RobotError:
+            self._console.pictures = {}
+        else:
+            self._console.pictures = {c: (observation[c],) * 2 for c in camera_names(self._robot)}
+        self._last = time.monotonic()
 
 
 @dataclass(frozen=True)
@@ -57,7 +82,7 @@ def restore(
     check_point(point, robot, limits)
     check = StartCheck(points, point, tolerance or Tolerance())
     clock = clock_of(robot)
-    begun, attempts = clock.now(), 0
+    begun, attempts, live_pictures = clock.now(), 0, LivePictures(robot, console)
     error: StartError | None = None
 
     def over(reason: str = "") -> Restored:
@@ -69,6 +94,7 @@ def restore(
         "Take the objects off the table and keep your hands away: the arm moves to where it was.",
         ("go", "skip"),
         details,
+        live_pictures,
     )
     if said.button == "skip":
         return over("skipped by the operator before the arm moved")
@@ -80,7 +106,9 @@ def restore(
             point,
             motion or MotionConfig(),
             stopped=lambda: console.stopped or console.phone_gone,
-            confirm=lambda text: console.ask("confirm", text, ("yes", "no"), details).button == "yes",
+            confirm=lambda text: (
+                console.ask("confirm", text, ("yes", "no"), details, live_pictures).button == "yes"
+            ),
             given=limits,
         )
     except StoppedError as err:
@@ -90,12 +118,12 @@ def restore(
 
     def look() -> None:
         nonlocal error, last
-        if clock.now() - last < _LIVE_S:
+        if time.monotonic() - last < _LIVE_S:
             return
         error, live = check.measure(robot)
         console.pictures = {c: (check.references[c].picture, p) for c, p in live.items()}
         console.update(start_error=error.as_json())
-        last = clock.now()
+        last = time.monotonic()
 
     while True:
         last = float("-inf")

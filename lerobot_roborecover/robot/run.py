@@ -18,7 +18,7 @@ from lerobot_roborecover.robot.console import Answer, Console
 from lerobot_roborecover.robot.plan import LockedPlan, PlannedPolicy, PlannedTrial
 from lerobot_roborecover.robot.points import PointSet, RobotPoint
 from lerobot_roborecover.robot.recorder import Recorder
-from lerobot_roborecover.robot.restore import restore
+from lerobot_roborecover.robot.restore import LivePictures, restore
 from lerobot_roborecover.robot.run_journal import RunJournal, dataset_folder
 from lerobot_roborecover.robot.trial_columns import COLUMNS, trial_values
 from lerobot_roborecover.scenario import Outcome, Start
@@ -97,12 +97,13 @@ class RobotRun:
 
         for point in self._by_id.values():
             check_point(point, self.robot, self.config.limits)
+        self._say_raters()
         done, only, judged = 0, self.config.only, None
         pending = self.journal.pending()
         if pending is not None:
             self.say(f"trial {pending['order'] + 1} was run and has no verdict yet")
             judged = self.plan.trials[pending["order"]]
-            self._judge(judged, pending)
+            self._judge(judged, pending, again=True)
             done += 1
         if only is not None:
             if judged is None or (judged.point, judged.code) != only:
@@ -121,8 +122,8 @@ class RobotRun:
             trial = left[0]
             said = self.console.ask(
                 "next",
-                f"Trial {trial.order + 1} of {len(self.plan.trials)}: policy {trial.code}.",
-                ("go", "undo", "pause"),
+                f"{self._title(trial)}.{self._last(finished)}",
+                ("go", *(("undo",) if finished else ()), "pause"),
                 {"point": trial.point, "code": trial.code, "done": len(finished)},
             )
             if said.button == "pause":
@@ -137,6 +138,25 @@ class RobotRun:
         self.console.show("over", f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done.")
         self.say(f"{pluralize(total, 'trial')} of {len(self.plan.trials)} in {self.journal.log}")
         return total
+
+    def _title(self, trial: PlannedTrial) -> str:
+        return f"Trial {trial.order + 1} of {len(self.plan.trials)}, policy {trial.code}"
+
+    def _last(self, finished: Mapping[int, Mapping[str, Any]]) -> str:
+        """What was said of the trial before, which Undo would take back."""
+        if not finished:
+            return ""
+        order, row = list(finished.items())[-1]
+        said = "not run" if row["outcome"] == Outcome.STATE_MISMATCH else row["robot"]["verdict"]
+        return f" Trial {order + 1}: {said}."
+
+    def _say_raters(self) -> None:
+        """Says that verdicts are from now on another person's."""
+        others = sorted({r["robot"]["rater"] for r in self.journal.rows().values()} - {self.config.rater})
+        if others:
+            self.say(
+                f"verdicts so far are by {', '.join(others)}; from here on they are by {self.config.rater}"
+            )
 
     def _next_of(self, point: str, code: str) -> PlannedTrial:
         """The next trial of one point and code; one that was invalid is taken back and run again.
@@ -161,9 +181,12 @@ class RobotRun:
     def _undo(self) -> None:
         """Takes the latest verdict back and asks for it again where the trial was rolled out."""
         order = self.journal.undo()
+        if order is None:
+            return
+        self.say(f"trial {order + 1}: taken back")
         pending = self.journal.pending()
-        if order is not None and pending is not None and pending["order"] == order:
-            self._judge(self.plan.trials[order], pending)
+        if pending is not None and pending["order"] == order:
+            self._judge(self.plan.trials[order], pending, again=True)
 
     def _trial(self, trial: PlannedTrial) -> None:
         free = shutil.disk_usage(self.config.folder).free
@@ -241,8 +264,14 @@ class RobotRun:
         self.journal.note("rollout", **record)
         self._judge(trial, record)
 
-    def _judge(self, trial: PlannedTrial, record: Mapping[str, Any]) -> None:
-        """Asks how a trial ended, and writes it."""
+    def _judge(self, trial: PlannedTrial, record: Mapping[str, Any], again: bool = False) -> None:
+        """Asks how a trial ended, and writes it.
+
+        Args:
+            trial: of the plan.
+            record: of its rollout.
+            again: it was run earlier: its recording is shown, since the table has changed.
+        """
         if record["ended"] in ("trouble", "policy"):
             outcome = Outcome.POLICY_ERROR if record["ended"] == "policy" else Outcome.SIM_ERROR
             row = self._row(trial, record, outcome, record["problem"], "invalid")
@@ -250,7 +279,7 @@ class RobotRun:
             self.say(f"trial {trial.order + 1}: {record['problem']}")
             return
         early = record["button"] if record["button"] in ("success", "failure") else ""
-        said = Answer(early) if early else self._verdict(trial)
+        said = Answer(early) if early else self._verdict(trial, record["episode"] if again else None)
         note = said.values.get("note", "")[:2000]
         if said.button == "invalid":
             reason = said.values.get("reason", "other")
@@ -262,16 +291,24 @@ class RobotRun:
         self.journal.finish(trial.order, row)
         self.say(f"trial {trial.order + 1}: {said.button}")
 
-    def _verdict(self, trial: PlannedTrial) -> Answer:
+    def _verdict(self, trial: PlannedTrial, episode: int | None) -> Answer:
+        from lerobot_roborecover.robot.episodes import Episodes
+        from lerobot_roborecover.robot.rate import Recording
+
+        text, pictures = f"{self._title(trial)}: is the task done?", LivePictures(self.robot, self.console)
+        if episode is not None:
+            text = f"{self._title(trial)}, recorded: was the task done at its end?"
+            pictures = Recording(self.console, Episodes(dataset_folder(self.config.folder)), episode)
         return self.console.ask(
             "verdict",
-            "Is the task done, as the instruction says?",
+            text,
             ("success", "failure", "invalid"),
             {
                 "instruction": self._by_id[trial.point].scenario.task.instruction,
                 "code": trial.code,
                 "reasons": list(REASONS),
             },
+            pictures,
         )
 
     def _row(

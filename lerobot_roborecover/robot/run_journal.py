@@ -81,6 +81,9 @@ class RunJournal:
         for record in self._journal.records:
             if record["kind"] == "rollout":
                 rollouts[record["order"]] = record
+            elif record["kind"] == "undo" and record["order"] in rollouts:
+                # The button that ended it was the verdict that was taken back.
+                rollouts[record["order"]] = {**rollouts[record["order"]], "button": ""}
         done = self.rows()
         waiting = [record for order, record in rollouts.items() if order not in done]
         return waiting[-1] if waiting else None

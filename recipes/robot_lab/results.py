@@ -88,7 +88,7 @@ def _measured(rows: Sequence[TrialRow], true_mm: np.ndarray) -> Table:
     estimated = MM_PER_PX * np.array([np.nan if p is None else p for p in pixels])
     gap = estimated - true_mm
     joints = [0.0 if e is None else e.worst("joint") or 0.0 for e in errors]
-    slope = verdict_slope(list(rows), "object_px")
+    slope = verdict_slope(list(rows), "object_px").estimate
     values: tuple[tuple[str, float | int | str], ...] = (
         ("trials run", len(run)),
         ("starts refused", len(rows) - len(run)),

@@ -50,7 +50,25 @@ def test_separated_or_constant_data_have_no_slope():
     design = np.stack([np.ones(20), error], 1)
     assert np.isnan(logistic_slope(design, (error < 1.5).astype(float)).value)
     same = [robot_row(i, 0, i % 2 == 0, 1.0) for i in range(10)]
-    assert np.isnan(verdict_slope(same, "object_px").value)
+    apart = [robot_row(i, 0, i < 5, 0.1 * i) for i in range(10)]
+    alike = [robot_row(i, 0, True, 0.1 * i) for i in range(10)]
+    unmeasured = [robot_row(i, 0, i % 2 == 0, None) for i in range(10)]
+    for rows, reason in (
+        (same, "all starts were alike"),
+        (apart, "successes and failures do not overlap"),
+        (alike, "each policy's verdicts are all alike"),
+        (unmeasured, "it was not measured"),
+        (apart[3:6], "fewer than 4 trials"),
+    ):
+        found = verdict_slope(rows, "object_px")
+        assert np.isnan(found.estimate.value)
+        assert found.reason == reason
+
+
+def test_a_policy_whose_verdicts_are_all_alike_does_not_hide_the_others_slope():
+    mixed = rows_of("act@1", 2.0, -1.5)
+    always = [robot_row(i, 0, True, 0.1 * i, policy="pi@2") for i in range(20)]
+    assert verdict_slope(mixed + always, "object_px") == verdict_slope(mixed, "object_px")
 
 
 @pytest.mark.slow
@@ -63,10 +81,12 @@ def test_a_report_of_robots_shows_how_far_off_the_starts_were(tmp_path):
     starts, slope = robot_tables(results)
     act = next(row for row in starts.rows if row[0].startswith("act"))
     assert act[1:4:2] == (61, 1)
-    found = dict(slopes(results).rows)["objects, px"]
+    found = next(row[2] for row in slopes(results).rows if row[0] == "objects, px")
     assert found.high < 0 < found.value + 4
     assert slope.name == "robot_slopes"
-    report([str(log)], tmp_path / "report")
+    said = report([str(log)], tmp_path / "report").text()
+    assert "Start errors, medians" in said
+    assert "Macro" not in said, "the paper's nine cells are none of a robot's"
     assert "How far off the starts were" in (tmp_path / "report" / "report.html").read_text("utf-8")
     assert (tmp_path / "report" / "tables" / "robot_starts.csv").is_file()
     assert summary(rows).reset_s == 90.0

@@ -93,7 +93,7 @@ def test_a_second_rater_scores_the_recordings_blind(tmp_path):
     import threading
 
     from lerobot_roborecover.robot.console import Console
-    from lerobot_roborecover.robot.rate import cohens_kappa, rate_all
+    from lerobot_roborecover.robot.rate import rate_all
     from lerobot_roborecover.scenario import ScenarioError
     from tests.logs.test_robot_rows import TRIAL, robot_row
     from tests.robot.test_rollout import roll
@@ -115,21 +115,25 @@ def test_a_second_rater_scores_the_recordings_blind(tmp_path):
     with pytest.raises(ScenarioError, match="gave this run's first verdicts"):
         rate_all(folder, "kim", 0, Console(), print)
     console = Console()
-    shown_to_rater = []
+    shown_to_rater, undone = [], []
 
     def press():
         while console.state()["name"] != "over":
             state = console.state()
             if state["name"] == "rate":
                 shown_to_rater.append(state)
-                console.press("success")
+                undo = "undo" in state["buttons"] and not undone
+                if console.press("undo" if undo else "success") and undo:
+                    undone.append(state["text"])
 
     thread = threading.Thread(target=press)
     thread.start()
     assert rate_all(folder, "lee", 0, console, lambda line: None) == 2
     thread.join(10)
+    assert undone == ["1 of 2 rated. The one before: success. Is the task done at the end?"]
     assert all("code" not in state["details"] for state in shown_to_rater)
-    from lerobot_roborecover.robot.rate import agreement_of, agreement_text
+    from lerobot_roborecover.analysis.second_rater import agreement_of, cohens_kappa
+    from lerobot_roborecover.robot.rate import agreement_text
 
     count, share, kappa = agreement_of(folder)["lee"]
     assert (count, share, kappa) == (2, 0.5, 0.0)

@@ -134,28 +134,72 @@ def test_a_certificate_makes_it_https(tmp_path, monkeypatch):
 def test_the_ghost_and_the_buttons_in_a_browser(served):
     console, phone, _ = served
     picture = np.full((48, 48, 3), 90, np.uint8)
-    console.pictures = {"top": (picture, picture)}
     error = {"joints": {}, "problems": ["camera top: objects are 4.2 px off, at most 2"]}
     error["cameras"] = {"top": {"background_px": 0.1, "object_px": 4.2, "similarity": 0.9, "tag_mm": None}}
     said = []
     details = {"instruction": "push the puck", "start_error": error}
-    asked = threading.Thread(
-        target=lambda: said.append(console.ask("place", "Put it back.", ("done", "skip"), details))
-    )
+
+    def look():
+        console.pictures = {"top": (picture, picture)}
+
+    def run():
+        said.append(console.ask("place", "Put it back.", ("done", "skip"), details, look))
+        said.append(console.ask("verdict", "Done?", ("success", "failure", "invalid"), details, look))
+
+    asked = threading.Thread(target=run)
     asked.start()
     with browsing() as visit:
         page, complaints = visit(phone.address)
+        page.set_viewport_size({"width": 420, "height": 800})
         page.fill("#code", phone.door.code)
         page.click("#enter")
         page.wait_for_selector("#cameras img")
         page.wait_for_selector("text=top: camera 0.1 px, objects 4.2 px")
         assert page.inner_text("#problems") == error["problems"][0]
         page.click("text=edges")
+        _fits(page)
         page.click("#buttons [data-name=done]")
+        page.wait_for_selector("#buttons [data-name=invalid]")
+        page.wait_for_selector("#cameras img[src*='/live']")
+        _fits(page)
+        page.click("#buttons [data-name=success]")
         asked.join(20)
         page.click("#stop")
         page.wait_for_selector("text=STOPPED")
         # Before the code was typed the page asked whether it is inside, and was not.
         assert [c for c in complaints if "403" not in c] == []
-    assert said[0].button == "done"
+    assert [answer.button for answer in said] == ["done", "success"]
     assert console.stopped
+
+
+def _fits(page):
+    """On a phone the picture takes the width, and the buttons are seen without scrolling."""
+    assert page.locator("#cameras img").first.bounding_box()["width"] > 300
+    last = page.locator("#buttons button").last.bounding_box()
+    assert last["x"] + last["width"] <= 420
+    assert last["y"] + last["height"] <= 800
+
+
+@pytest.mark.browser
+def test_a_rater_sees_where_a_recording_ends_and_nothing_to_stop(served):
+    console, phone, _ = served
+    picture, moment = np.full((48, 48, 3), 90, np.uint8), [1]
+
+    def look():
+        console.update(moment=moment[0], moments=3)
+        console.pictures = {"top": (picture, picture)}
+
+    asked = threading.Thread(target=lambda: console.ask("rate", "Done at its end?", ("success",), {}, look))
+    asked.start()
+    with browsing() as visit:
+        page, _complaints = visit(phone.address)
+        page.fill("#code", phone.door.code)
+        page.click("#enter")
+        page.wait_for_selector("text=top: 1 of 3")
+        assert page.is_hidden("#stop")
+        page.keyboard.press("Space")
+        moment[0] = 3
+        page.wait_for_selector("text=top: the end")
+        page.click("#buttons [data-name=success]")
+        asked.join(20)
+    assert not console.stopped

@@ -71,11 +71,12 @@ def go(made, folder, robot, operator, **changes):
     from lerobot_roborecover.robot.run import RobotRun, RunConfig
 
     stop_after, only = changes.pop("stop_after", 0), changes.pop("only", None)
+    rater = changes.pop("rater", "kim")
     locked, points = lock_plan(plan_of(made, **changes), folder)
     lines: list[str] = []
     journal = RunJournal(folder)
     try:
-        config = RunConfig(folder, "kim", stop_after=stop_after, only=only, external="t-1" if only else "")
+        config = RunConfig(folder, rater, stop_after=stop_after, only=only, external="t-1" if only else "")
         RobotRun(robot, locked, points, journal, Console(operator), config, say=lines.append).run()
     finally:
         journal.close()
@@ -183,7 +184,7 @@ def test_the_order_is_random_within_blocks_and_the_same_each_time(made, tmp_path
     assert len(orders) > 1
 
 
-def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path):
+def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path, monkeypatch):
     from lerobot_roborecover.robot.lab.operator import SimulatedOperator
 
     with lab(made) as robot:
@@ -193,7 +194,22 @@ def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path):
             "verdict": [Answer("failure"), Answer("invalid", {"reason": "person", "note": "a hand came in"})],
             "next": [Answer("go"), Answer("undo"), Answer("pause")],
         }
-        rows, _ = go(made, tmp_path, robot, Spoken(operator, **said))
+        asked: dict[str, list[str]] = {}
+        spoken = Spoken(operator, **said)
+        show = Console.show
+
+        def keep(console, name, text="", *args):
+            asked.setdefault(name, []).append(text)
+            show(console, name, text, *args)
+
+        monkeypatch.setattr(Console, "show", keep)
+        rows, lines = go(made, tmp_path, robot, spoken)
+    first, again = asked["verdict"]
+    assert first.startswith("Trial 1 of 4, policy ")
+    assert first.endswith(": is the task done?")
+    assert again.endswith(", recorded: was the task done at its end?")
+    assert asked["next"][1].endswith(" Trial 1: failure.")
+    assert "trial 1: taken back" in lines
     (row,) = rows
     assert (row.outcome, row.reason) == ("sim_error", "invalid (person): a hand came in")
     # A crash between the journal and the log: the log is put right.
@@ -234,6 +250,23 @@ def test_after_a_crash_before_the_verdict_only_the_verdict_is_asked(made, tmp_pa
         rows, lines = go(made, tmp_path, robot, Spoken(operator, **said))
     assert [r.outcome for r in rows] == ["success"]
     assert "has no verdict yet" in lines[0]
+
+
+def test_a_button_that_ended_a_trial_is_its_verdict_until_it_is_taken_back(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    said = {
+        "running": [Answer("success")],
+        "verdict": [Answer("failure")],
+        "next": [Answer("go"), Answer("undo"), Answer("pause")],
+    }
+    with lab(made) as robot:
+        rows, _ = go(made, tmp_path, robot, Spoken(SimulatedOperator(robot, sd_mm=0.0), **said))
+        assert [r.outcome for r in rows] == ["horizon"]
+        _, lines = go(
+            made, tmp_path, robot, Spoken(SimulatedOperator(robot), next=[Answer("pause")]), rater="lee"
+        )
+    assert lines[0] == "verdicts so far are by kim; from here on they are by lee"
 
 
 def test_a_clock_that_jumps_is_in_the_row_and_changes_no_duration(made, tmp_path, monkeypatch):

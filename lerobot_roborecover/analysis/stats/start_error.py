@@ -1,8 +1,9 @@
 """How far robots' trials started from their recovery points, and whether that moved the verdicts.
 
 The slope is that of a logistic regression of success on the start error with an intercept for each policy, so
-that a policy which happened to get the worse starts is not mistaken for an effect of the starts. It is fitted
-by maximum likelihood (Newton's method) with Wald intervals; where the data separate, there is no estimate.
+that a policy which happened to get the worse starts is not mistaken for an effect of the starts. A policy
+whose verdicts are all alike says nothing of the slope and is left out. It is fitted by maximum likelihood
+(Newton's method) with Wald intervals; where the data separate, there is no estimate.
 """
 
 from __future__ import annotations
@@ -22,6 +23,21 @@ MEASURES = (("joint", "joint, units"), ("background_px", "camera, px"), ("object
 _ITERATIONS, _STEP = 50, 1e-8
 _SEPARATED = 30.0
 """Log-odds beyond which the likelihood has no maximum."""
+
+
+_LEAST_TRIALS = 4
+
+
+@dataclass(frozen=True)
+class VerdictSlope:
+    """How the verdict went with the start error."""
+
+    estimate: Estimate
+    """Change of the log-odds of success per unit."""
+    trials: int
+    """That it is fitted to."""
+    reason: str = ""
+    """Why there is no estimate."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +89,7 @@ def _quantile(values: np.ndarray, share: float) -> float:
     return float(np.quantile(known, share)) if len(known) else float("nan")
 
 
-def verdict_slope(rows: Sequence[TrialRow], measure: str, level: float = 0.95) -> Estimate:
+def verdict_slope(rows: Sequence[TrialRow], measure: str, level: float = 0.95) -> VerdictSlope:
     """Change of the log-odds of success per unit of start error, of valid trials.
 
     Args:
@@ -87,10 +103,21 @@ def verdict_slope(rows: Sequence[TrialRow], measure: str, level: float = 0.95) -
     policies = np.array([r.policy for r in kept])[known]
     success = np.array([r.success for r in kept], float)[known]
     error = errors[known]
-    if len(error) < 4 or error.std() < 1e-9:
-        return UNDEFINED
-    design = np.stack([*(policies == name for name in sorted(set(policies))), error], 1).astype(float)
-    return logistic_slope(design, success, level)
+    if not len(error):
+        return VerdictSlope(UNDEFINED, 0, "it was not measured")
+    mixed = sorted(name for name in set(policies) if 0 < success[policies == name].mean() < 1)
+    if not mixed:
+        return VerdictSlope(UNDEFINED, 0, "each policy's verdicts are all alike")
+    kept_here = np.isin(policies, mixed)
+    policies, success, error = policies[kept_here], success[kept_here], error[kept_here]
+    if len(error) < _LEAST_TRIALS:
+        return VerdictSlope(UNDEFINED, len(error), f"fewer than {_LEAST_TRIALS} trials")
+    if error.std() < 1e-9:
+        return VerdictSlope(UNDEFINED, len(error), "all starts were alike")
+    design = np.stack([*(policies == name for name in mixed), error], 1).astype(float)
+    found = logistic_slope(design, success, level)
+    reason = "successes and failures do not overlap" if found is UNDEFINED else ""
+    return VerdictSlope(found, len(error), reason)
 
 
 def logistic_slope(design: np.ndarray, success: np.ndarray, level: float = 0.95) -> Estimate:

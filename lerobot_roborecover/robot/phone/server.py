@@ -50,11 +50,11 @@ class Door:
     def __init__(self, say: Callable[[str], None]):
         self._say, self._lock = say, threading.Lock()
         self._token, self._tries = "", 0
-        self._new_code()
+        self._new_code("code for the phone")
 
-    def _new_code(self) -> None:
+    def _new_code(self, what: str) -> None:
         self.code, self._tries = f"{secrets.randbelow(10**6):06d}", 0
-        self._say(f"code for the phone: {self.code}")
+        self._say(f"{what}: {self.code}")
 
     def enter(self, code: str, take_over: bool) -> str:
         """Exchanges a code for a token.
@@ -70,12 +70,12 @@ class Door:
             if not hmac.compare_digest(code.encode(), self.code.encode()):
                 self._tries += 1
                 if self._tries >= MAX_TRIES:
-                    self._new_code()
+                    self._new_code(f"{MAX_TRIES} wrong codes were typed; from now on it is")
                 raise Refusal(403, "this is not the code that the terminal shows")
             if self._token and not take_over:
                 raise Refusal(409, "another phone is the console; take over, or use that one")
             self._token = secrets.token_urlsafe(24)
-            self._new_code()
+            self._new_code("a phone is in; the code for another one, should it take over")
             return self._token
 
     def check(self, token: str) -> None:

@@ -2,6 +2,7 @@
 
 const byId = (id) => document.getElementById(id);
 const VIEWS = ["blend", "difference", "edges", "recorded", "live"];
+const STILL = ["rate", "over"]; // screens without a robot that moves
 const WORDS = {
   go: "Go", skip: "Skip", yes: "Yes", no: "No", done: "Done", success: "Success", failure: "Failure",
   invalid: "Invalid", undo: "Undo last verdict", pause: "Pause", mark: "Mark: it went wrong", end: "End",
@@ -68,25 +69,30 @@ function showScreen(state) {
 }
 
 function showPictures(state) {
-  const placing = ["place", "rate"].includes(state.name) ? state.cameras : [];
-  byId("views").hidden = state.name !== "place";
+  const placing = state.name === "place";
+  const { moment, moments } = state.details;
+  byId("views").hidden = !placing;
   const errors = (state.details.start_error || {}).cameras || {};
-  const figures = placing.map((camera) => {
+  const figures = state.cameras.map((camera) => {
     const figure = byId("cameras").querySelector(`[data-camera="${camera}"]`) || document.createElement("figure");
     if (!figure.dataset.camera) {
       figure.dataset.camera = camera;
       figure.append(new Image(), document.createElement("figcaption"));
-      figure.firstChild.alt = `Ghost of camera ${camera}`;
+      figure.firstChild.alt = `Picture of camera ${camera}`;
     }
-    figure.firstChild.src = `api/ghost/${encodeURIComponent(camera)}/${state.name === "rate" ? "live" : view}?${Date.now()}`;
+    figure.firstChild.src = `api/ghost/${encodeURIComponent(camera)}/${placing ? view : "live"}?${Date.now()}`;
     const found = errors[camera] || {};
     const said = [
       ["camera", found.background_px, "px"], ["objects", found.object_px, "px"], ["tags", found.tag_mm, "mm"],
     ].filter(([, value]) => value !== null && value !== undefined);
     const numbers = said.map(([what, value, unit]) => `${what} ${value.toFixed(1)} ${unit}`).join(", ");
-    figure.lastChild.textContent = state.name === "rate" ? camera : `${camera}: ${numbers || "no number"}`;
     const bad = ((state.details.start_error || {}).problems || []).some((p) => p.includes(`camera ${camera}:`));
-    figure.lastChild.className = bad ? "bad" : "good";
+    let caption = camera;
+    if (placing) caption = `${camera}: ${numbers || "no number"}`;
+    else if (moments) caption = moment < moments ? `${camera}: ${moment} of ${moments}` : `${camera}: the end`;
+    figure.lastChild.textContent = caption;
+    figure.lastChild.className = placing ? (bad ? "bad" : "good") : "";
+    figure.classList.toggle("end", Boolean(moments) && moment === moments);
     return figure;
   });
   byId("cameras").replaceChildren(...figures);
@@ -111,8 +117,9 @@ async function look() {
       showPictures(state);
       if (away) complain(null);
       away = false;
+      byId("stop").hidden = STILL.includes(state.name);
       if (state.name === "over") { // the server ends with the command
-        byId("stop").hidden = byId("leave").hidden = true;
+        byId("leave").hidden = true;
         return;
       }
     } catch (error) {
@@ -144,7 +151,7 @@ byId("leave").addEventListener("click", async () => {
   }
 });
 document.addEventListener("keydown", (event) => {
-  if (event.code === "Space" && event.target.tagName !== "INPUT") {
+  if (event.code === "Space" && event.target.tagName !== "INPUT" && !byId("stop").hidden) {
     event.preventDefault();
     press("stop");
   }
