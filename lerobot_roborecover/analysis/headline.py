@@ -70,8 +70,9 @@ def headline_of(results: Results) -> Headline:
             "Its rate is biased, and no verdict rests on it: its trial counts go with its outcomes. Evaluate "
             "every scenario the same number of times."
         )
-    initial = initial_estimates(results)[results.compared.policies[best]].value
-    first = "" if math.isnan(initial) else f"{100 * initial:.1f} % from initial states, "
+    initial = initial_estimates(results)[results.compared.policies[best]]
+    sure = "" if math.isnan(initial.low) else f" ({_bounds(initial)})"
+    first = "" if math.isnan(initial.value) else f"{100 * initial.value:.1f} %{sure} from initial states, "
     claim = (
         f"Success of {name}: {first}{100 * rate.value:.1f} % from recovery points"
         f"{_intervals(results, best, rate)}."

@@ -285,7 +285,7 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
         line.show(progress)
         settled()
 
-    videos, result = None, RunResult()
+    videos, result, before = None, RunResult(), progress.done
     if count := _video_count(cfg):
         videos = VideoRecorder(out / "videos", count, cfg.runner.videos_of, ids, Start(run.protocol.start))
     if watch is not None:
@@ -303,6 +303,12 @@ def _run(cfg: RecoveryEvalConfig, run: EvalSession, scenarios: ScenarioSet, stop
     if watch is not None:
         record = watch.record(log.path)
     report(cfg, run, scenarios, [] if videos is None else videos.kept)
+    if videos is not None and before and len(videos.kept) < count:
+        print(
+            f"{pluralize(len(videos.kept), 'video')} of {count}: trials that the log had already are not run "
+            "again. For videos of them, name another --output_dir",
+            file=sys.stderr,
+        )
     if watch is not None and record is not None:
         print(f"{watch.words}\nsequential {record}; the table's own intervals take no stop into account")
         if watch.decided:

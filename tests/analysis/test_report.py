@@ -140,6 +140,17 @@ def test_numbers_in_json_are_those_of_the_rows(written):
         assert rsr[policy] == pytest.approx(np.mean(rates)), p
 
 
+def test_the_headline_says_how_sure_both_rates_are(written):
+    results, files, _ = written
+    best = results.ranked.arms[results.best_first[0]]
+    row = by_policy(next(t for t in files.tables if t.name == "overall"))[best]
+    first, recovery = row["Initial state %"], row["RSR %"]
+    assert headline(results).startswith(
+        f"Success of {best}: {100 * first.value:.1f} % ({100 * first.low:.1f} to {100 * first.high:.1f}) from "
+        f"initial states, {100 * recovery.value:.1f} % from recovery points (95 % interval "
+    )
+
+
 def test_a_policy_without_an_initial_arm_is_told_so(written):
     results, files, _ = written
     assert any(r.startswith("gamma@3: no trials from initial states") for r in results.remarks)

@@ -289,11 +289,14 @@ def test_videos_of_failures_are_bounded_and_whole(run, whole):
     assert sorted(Path(p).name for p in paths) == sorted(found)
 
 
-def test_videos_of_chosen_scenarios(run):
-    chosen = fake_scenario(1).id
+def test_videos_of_chosen_scenarios(run, capsys):
+    chosen, said = fake_scenario(1).id, "of 9: trials that the log had already are not run again"
     found = videos(run("--videos=9", f"--runner.videos_of={chosen}"))
     assert found
     assert all(name.startswith(chosen) for name in found)
+    assert said not in capsys.readouterr().err
+    assert videos(run("--videos=9", f"--runner.videos_of={fake_scenario(2).id}")) == found
+    assert f"{len(found)} videos {said}" in capsys.readouterr().err
 
 
 @pytest.mark.nightly
