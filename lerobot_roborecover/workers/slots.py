@@ -323,12 +323,19 @@ class SlotPool:
         return self._slots[:count]
 
     def worker_slots(self, count: int) -> list[SimulatorWorker]:
-        """The first `count` slots, of a pool whose slots are processes of their own."""
-        return [cast(SimulatorWorker, slot) for slot in self.slots(count) if not isinstance(slot, InlineSlot)]
+        """`count` slots of a pool whose slots are processes of their own.
+
+        Those that are there come first: one whose machine was lost finds no room on a cluster as long as the
+        others keep theirs.
+        """
+        self.slots(count)
+        made = [cast(SimulatorWorker, slot) for slot in self._slots if not isinstance(slot, InlineSlot)]
+        return sorted(made, key=lambda slot: slot.starting)[:count]
 
     def ask(self, command: str) -> Reply:
         """The first slot's reply to a command that has no argument."""
-        slot = self.slots(1)[0]
+        self.slots(1)
+        slot = min(self._slots, key=lambda each: getattr(each, "starting", False))
         for _ in range(MAX_ATTEMPTS):
             slot.send(command)
             reply = slot.receive()

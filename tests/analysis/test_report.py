@@ -145,9 +145,10 @@ def test_the_headline_says_how_sure_both_rates_are(written):
     best = results.ranked.arms[results.best_first[0]]
     row = by_policy(next(t for t in files.tables if t.name == "overall"))[best]
     first, recovery = row["Initial state %"], row["RSR %"]
+    bounds = f"{100 * first.low:.1f} to {100 * first.high:.1f}"
     assert headline(results).startswith(
-        f"Success of {best}: {100 * first.value:.1f} % ({100 * first.low:.1f} to {100 * first.high:.1f}) from "
-        f"initial states, {100 * recovery.value:.1f} % from recovery points (95 % interval "
+        f"Success of {best}: {100 * first.value:.1f} % ({bounds}) from initial states, "
+        f"{100 * recovery.value:.1f} % from recovery points (95 % interval "
     )
 
 

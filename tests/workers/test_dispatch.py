@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from lerobot_roborecover.workers.dispatch import map_ordered, map_unordered
-from lerobot_roborecover.workers.messages import InProgress, SlotFailure
-from lerobot_roborecover.workers.slots import MAX_ATTEMPTS
+from lerobot_roborecover.workers.messages import InProgress, SlotConfig, SlotFailure
+from lerobot_roborecover.workers.slots import MAX_ATTEMPTS, SlotPool
 
 
 class FragileSlot:
@@ -131,3 +131,16 @@ def test_slots_that_start_late_join_the_work():
     left = iter(range(4))
     assert len(list(map_unordered(slots, "run", lambda *_: next(left, None), lambda item: item))) == 4
     assert len(used) == 2
+
+
+def test_a_slot_that_finds_no_room_is_not_waited_for_while_others_are_idle():
+    """Four were made, two machines' worth; one machine is gone, and what was on it has no room any more."""
+    openings = iter([10**9, 0, 10**9, 0])
+    pool = SlotPool(SlotConfig("fake", {}), workers=True, timeout_s=1.0)
+    pool.make_with(lambda *_: FragileSlot(iter(()), Counter(), next(openings)))
+    pool.slots(4)
+    for count in (1, 2):
+        slots = pool.worker_slots(count)
+        assert not any(slot.starting for slot in slots)
+        assert list(map_ordered(slots, "run", range(3), lambda item: item)) == [0, 1, 2]
+    assert len(pool.worker_slots(4)) == 4
