@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.policy_tables import initial_estimates
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import of_robots
 from lerobot_roborecover.analysis.stats.contrasts import Contrast
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.resampling import masked_mean
@@ -47,10 +48,12 @@ def headline_of(results: Results) -> Headline:
     reached = masked_mean(results.ranked.reached_rates[best][:, None])[0]
     lost = int(results.ranked.by_infrastructure[best].sum())
     if lost and not math.isnan(reached):
+        how = "ended with a simulator or a machine"
+        if of_robots(results):
+            how = "ended with the equipment, or the rater called it invalid,"
         as_what = "counts as a failure" if lost == 1 else "count as failures"
         sentences.append(
-            f"{pluralize(lost, 'trial')} of it ended with a simulator or a machine and {as_what}; without, "
-            f"{100 * reached:.1f} %."
+            f"{pluralize(lost, 'trial')} of it {how} and {as_what}; without, {100 * reached:.1f} %."
         )
     if results.several_runs:
         sentences.append(_method(results, name))
@@ -138,8 +141,8 @@ def _standing(best: str, found: list[Contrast], rates: Mapping[str, float]) -> s
     if few:
         unit = found[0].unit
         parts.append(
-            f"No verdict on those that differ from {best} on fewer than {LEAST_DIFFERING} {unit}: "
-            f"{', '.join(few)}."
+            f"No verdict against {', '.join(few)}: fewer than {LEAST_DIFFERING} {unit} differ, too few for "
+            "any test."
         )
     if barred:
         parts.append(f"No verdict on those whose trial counts go with their outcomes: {', '.join(barred)}.")

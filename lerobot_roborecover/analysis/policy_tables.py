@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from lerobot_roborecover.analysis import published
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.robot_tables import of_robots
+from lerobot_roborecover.analysis.robot_tables import of_robots, outcome_words
 from lerobot_roborecover.analysis.stats.intervals import UNDEFINED, Estimate
 from lerobot_roborecover.analysis.stats.macro import (
     MACRO_9,
@@ -146,15 +146,16 @@ def initial_estimates(results: Results, *, as_in_the_paper: bool = False) -> lis
 def outcomes(results: Results) -> Table:
     """Trials by outcome, policy and start."""
     kinds = [o for o in Outcome if any(r.outcome == o for arm in results.study.arms for r in arm.rows)]
-    rows = []
+    rows, robots = [], of_robots(results)
     for arm in results.arms:
         counts = Counter(row.outcome for row in arm.rows)
         rows.append((arm.policy, arm.start.value, len(arm.rows), *(counts[k.value] for k in kinds)))
     columns = (
         Column("Policy"), Column("Start"), Column("Trials", "count"),
-        *(Column(kind.value.replace("_", " "), "count") for kind in kinds),
+        *(Column(outcome_words(kind, robots), "count") for kind in kinds),
     )  # fmt: skip
-    notes = ("All outcomes but success and horizon are invalid: the policy did not have its full chance.",)
+    valid = outcome_words(Outcome.HORIZON, robots)
+    notes = (f"All outcomes but success and {valid} are invalid: the policy did not have its full chance.",)
     return Table("outcomes", "How trials ended", columns, tuple(rows), notes)
 
 

@@ -12,7 +12,7 @@ from lerobot_roborecover.analysis.pair_tables import paired_contrasts, profiles,
 from lerobot_roborecover.analysis.policy_tables import beside_published, outcomes, overall
 from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.retry_tables import retry_tables
-from lerobot_roborecover.analysis.robot_tables import robot_tables
+from lerobot_roborecover.analysis.robot_tables import of_robots, robot_tables
 from lerobot_roborecover.analysis.runs_tables import runs_tables
 from lerobot_roborecover.analysis.stats.crossfit import oracle
 from lerobot_roborecover.analysis.stats.groups import Group, group_rates, source_matrix
@@ -182,6 +182,11 @@ def budgets(results: Results) -> Table:
         Column("Median steps to success", "number"),
     )  # fmt: skip
     notes = ("RSR in % had each trial been stopped at that share of its scenario's horizon.",)
+    if of_robots(results):
+        notes += (
+            "On a robot a success comes when the person presses the button; of a trial that was judged after "
+            "its time was up, that is the whole time.",
+        )
     return Table("budgets", "RSR at smaller step budgets", columns, tuple(rows), notes)
 
 

@@ -9,6 +9,7 @@ from lerobot_roborecover.analysis.results import Results
 from lerobot_roborecover.analysis.second_rater import FOLDER, LOG_FILE, agreement_of
 from lerobot_roborecover.analysis.stats.start_error import MEASURES, summary, verdict_slope
 from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.scenario import Outcome
 
 _MIN_SECONDS = 60.0
 _OVERALL = ("Trials", "Successes %")
@@ -27,6 +28,21 @@ def robot_tables(results: Results) -> list[Table]:
 def of_robots(results: Results) -> bool:
     """Whether any trial was on a robot."""
     return any(row.robot is not None for arm in results.study.arms for row in arm.rows)
+
+
+def outcome_words(outcome: Outcome, robots: bool) -> str:
+    """What tables and figures call an outcome.
+
+    Args:
+        outcome: of a trial.
+        robots: the trials are of robots, where a person judges and equipment fails.
+    """
+    on_robots = {
+        Outcome.HORIZON: "failure",
+        Outcome.SIM_ERROR: "equipment, or called invalid",
+        Outcome.STATE_MISMATCH: "start too far off",
+    }
+    return (on_robots if robots else {}).get(outcome, outcome.value.replace("_", " "))
 
 
 def starts_in_short(results: Results) -> Table:

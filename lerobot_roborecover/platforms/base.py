@@ -18,6 +18,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.platforms.catalog import TaskCatalog
 from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
+from lerobot_roborecover.utils.text import install_command
 
 if TYPE_CHECKING:
     from lerobot_roborecover.platforms.controls import Controls
@@ -264,7 +265,7 @@ class Platform(TaskCatalog):
     @property
     def install_command(self) -> str:
         """Command that installs the platform's packages."""
-        return f"pip install '{self.distribution}{f'[{self.extra}]' if self.extra else ''}'"
+        return install_command(self.extra, self.distribution)
 
     def action_space(self, width: int) -> gym.spaces.Box:
         """Actions that the simulator accepts.

@@ -11,6 +11,7 @@ from lerobot.utils.constants import ACTION
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.policies.checkpoint import is_other_width
 from lerobot_roborecover.policies.command_line import plain_output
+from lerobot_roborecover.utils.text import install_command
 
 
 def error_words(err: Exception) -> str:
@@ -43,7 +44,7 @@ def load_remedy(err: Exception, inputs: str = "") -> str:
     if kind & {"HfHubHTTPError", "LocalEntryNotFoundError", "HFValidationError"} or "huggingface hub" in text:
         return "check the spelling, the network, HF_HUB_OFFLINE, and hf auth login for a private model"
     if isinstance(err, ImportError):
-        return "install what it names: pip install 'lerobot_env_roborecover[policies]' has LeRobot's families"
+        return f"install what it names: {install_command('policies')} has LeRobot's families"
     if kind & {"OutOfMemoryError", "MemoryError"}:
         return "free memory there, or take another --policy.device"
     if isinstance(err, FileNotFoundError):

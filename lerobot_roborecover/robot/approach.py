@@ -13,6 +13,7 @@ from lerobot_roborecover.robot.connection import LIMIT_MARGIN, RobotError, askin
 from lerobot_roborecover.robot.points import RobotPoint
 
 _RATE_HZ = 20.0
+_NAMED_JOINTS = 3
 
 
 class StoppedError(RobotError):
@@ -70,10 +71,9 @@ def move_to(
     start = int(gaps.argmin())
     if gaps[start] > config.max_detour:
         start = 0
-        worst = names[int(np.abs(path[0] - here).argmax())]
         if not confirm(
-            f"The arm is {gaps.min():.0f} {point.units.get(worst) or 'units'} off the recorded approach "
-            f"({worst.removesuffix('.pos')}). Is a straight way to its start free?"
+            "The arm is off the recorded approach and would go straight to where that begins: "
+            f"{_moves(names, path[0] - here, point.units)}. Is that way free?"
         ):
             raise StoppedError("the straight way to the approach was not confirmed; move the arm by hand")
     for waypoint in path[start:]:
@@ -88,6 +88,14 @@ def move_to(
         _send(robot, names, goal, stopped)
         clock.sleep(1 / _RATE_HZ)
     return dict(zip(names, error.tolist(), strict=True))
+
+
+def _moves(names: list[str], gap: np.ndarray, units: Mapping[str, str]) -> str:
+    """The largest moves of a straight way, e.g. `x by +59 mm, y by -12 mm`."""
+    largest = sorted(range(len(names)), key=lambda j: -abs(gap[j]))[:_NAMED_JOINTS]
+    return ", ".join(
+        f"{names[j].removesuffix('.pos')} by {gap[j]:+.0f} {units.get(names[j]) or 'units'}" for j in largest
+    )
 
 
 def _within(path: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from lerobot_roborecover.robot.start_check import Tolerance
 KEYS = {
     "space": "stop", "g": "go", "k": "skip", "y": "yes", "n": "no", "d": "done", "s": "success",
     "f": "failure", "i": "invalid", "u": "undo", "p": "pause", "m": "mark", "e": "end",
-    "t": "takeover", "h": "handback",
+    "t": "takeover", "h": "handback", "q": "finish",
 }  # fmt: skip
 """Button by key of the terminal."""
 NAMED_KEYS = ("space", "enter", "tab", "backspace", "esc", "left", "right", "up", "down")
@@ -221,7 +221,7 @@ def _keyboard(console: Console, keys: Mapping[str, str]) -> Any:
 
     def pressed(name: str) -> None:
         if name in known:
-            console.press(known[name])
+            console.press_key(known[name])
 
     listener = TerminalKeyListener(pressed)
     listener.start()

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+SETTLE_S = 0.7
+"""A key that is pressed sooner after a new screen was meant for the one before."""
 PHONE_GONE_S = 8.0
 """A phone that has not asked for this long is gone."""
 
@@ -46,7 +48,7 @@ class Console:
         self._answers: deque[Answer] = deque()
         self._stop = threading.Event()
         self._screen: dict[str, Any] = {"name": "starting", "text": "", "buttons": [], "details": {}}
-        self._version = 0
+        self._version, self._shown_at = 0, float("-inf")
         self._heard: float | None = None
         self.pictures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         """Recorded and live picture by camera, of the present screen."""
@@ -64,7 +66,7 @@ class Console:
                 "buttons": list(buttons),
                 "details": details or {},
             }
-            self._version += 1
+            self._version, self._shown_at = self._version + 1, self._seconds()
             self._answers.clear()
             self.pictures = {}
             self._lock.notify_all()
@@ -142,12 +144,28 @@ class Console:
         """The phone has said that it goes."""
         self._heard = None
 
-    def press(self, button: str, values: dict[str, str] | None = None) -> bool:
-        """Takes a button; False where the present screen has none of that name. `stop` always works."""
+    def press_key(self, button: str) -> bool:
+        """Takes a button from a keyboard, whose user may be looking at the robot; `stop` always works."""
+        if button != "stop" and self._seconds() - self._shown_at < SETTLE_S:
+            return False
+        return self.press(button)
+
+    def press(self, button: str, values: dict[str, str] | None = None, version: int | None = None) -> bool:
+        """Takes a button; `stop` always works.
+
+        Args:
+            button: its name.
+            values: texts beside it.
+            version: of the screen that was pressed on; None takes the present one.
+
+        Returns:
+            False where the present screen is another one, or has no such button.
+        """
         if button == "stop":
             self._stop.set()
         with self._lock:
-            known = button == "stop" or button in self._screen["buttons"]
+            present = version is None or version == self._version
+            known = button == "stop" or (present and button in self._screen["buttons"])
             if known and button in self._screen["buttons"]:
                 self._answers.append(Answer(button, dict(values or {})))
                 self._lock.notify_all()

@@ -80,7 +80,8 @@ def rate_all(run: Path, rater: str, seed: int, console: Console, say: Callable[[
             episode = _episode(left[0])
             said = console.ask(
                 "rate",
-                f"{len(done)} of {len(rows)} rated.{_before(given, done)} Is the task done at the end?",
+                f"{len(rows) - len(left)} of {len(rows)} rated.{_before(given, done)} "
+                "Is the task done at the end?",
                 ("success", "failure", *(("undo",) if given else ()), "pause"),
                 {"instruction": left[0].instruction},
                 meanwhile=Recording(console, episodes, episode),

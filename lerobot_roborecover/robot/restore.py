@@ -43,6 +43,14 @@ class LivePictures:
         self._last = time.monotonic()
 
 
+def _words(tolerance: Tolerance) -> str:
+    """What a start may be off by, as far as it is limited."""
+    limits = (("objects", tolerance.object_px, "px"), ("camera", tolerance.background_px, "px"),
+              ("tags", tolerance.tag_mm if tolerance.tag_side_mm else 0.0, "mm"))  # fmt: skip
+    said = ", ".join(f"{what} {limit:g} {unit}" for what, limit, unit in limits if limit)
+    return f" At most off by: {said}." if said else ""
+
+
 @dataclass(frozen=True)
 class Restored:
     """How a restoring went."""
@@ -88,6 +96,7 @@ def restore(
     def over(reason: str = "") -> Restored:
         return Restored(error, round(clock.now() - begun, 2), attempts, reason)
 
+    allowed = _words(tolerance or Tolerance())
     details = {"point": point.id, "instruction": point.scenario.task.instruction, "truth": dict(point.truth)}
     said = console.ask(
         "clear",
@@ -129,7 +138,8 @@ def restore(
         last = float("-inf")
         said = console.ask(
             "place",
-            "Put the objects back until they cover the ghost, then take your hands away and press Done.",
+            "Put the objects back until they cover the ghost, then take your hands away and press Done."
+            f"{allowed}",
             ("done", "skip"),
             {**details, "start_error": None if error is None else error.as_json()},
             meanwhile=look,

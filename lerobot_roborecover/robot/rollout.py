@@ -125,6 +125,7 @@ class RecordedRollout:
             self.end.duration_s = tick - start
             if self.end.steps >= horizon or self.end.duration_s >= self._limit_s:
                 return
+            self._console.update(left_s=max(self._limit_s - self.end.duration_s, 0.0))
             driving, over = self._heard(driving)
             if over:
                 return

@@ -99,7 +99,9 @@ class RobotRun:
             check_point(point, self.robot, self.config.limits)
         self._say_raters()
         done, only, judged = 0, self.config.only, None
-        pending = self.journal.pending()
+        pending, cut_off = self.journal.pending(), self.journal.cut_off()
+        if cut_off is not None:
+            self.say(f"trial {cut_off + 1} was cut off before it ended; it is run again")
         if pending is not None:
             self.say(f"trial {pending['order'] + 1} was run and has no verdict yet")
             judged = self.plan.trials[pending["order"]]
@@ -117,22 +119,22 @@ class RobotRun:
         while not self.config.stop_after or done < self.config.stop_after:
             finished = self.journal.rows()
             left = [t for t in self.plan.trials if t.order not in finished]
-            if not left:
-                break
-            trial = left[0]
-            said = self.console.ask(
-                "next",
-                f"{self._title(trial)}.{self._last(finished)}",
-                ("go", *(("undo",) if finished else ()), "pause"),
-                {"point": trial.point, "code": trial.code, "done": len(finished)},
-            )
-            if said.button == "pause":
+            if not left and not done:
+                break  # it was over already
+            undo = ("undo",) if finished else ()
+            if left:
+                text = f"{self._title(left[0])}. Go puts robot and scene back and runs it."
+                said = self.console.ask("next", text + self._last(finished), ("go", *undo, "pause"))
+            else:
+                text = f"All {len(self.plan.trials)} trials are done."
+                said = self.console.ask("finished", text + self._last(finished), ("finish", *undo))
+            if said.button in ("pause", "finish"):
                 break
             if said.button == "undo":
                 self._undo()
                 continue
             self.console.release()
-            self._trial(trial)
+            self._trial(left[0])
             done += 1
         total = len(self.journal.rows())
         self.console.show("over", f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done.")
@@ -140,7 +142,8 @@ class RobotRun:
         return total
 
     def _title(self, trial: PlannedTrial) -> str:
-        return f"Trial {trial.order + 1} of {len(self.plan.trials)}, policy {trial.code}"
+        """Without the policy's code: who has learned which code does better is not blind any more."""
+        return f"Trial {trial.order + 1} of {len(self.plan.trials)}"
 
     def _last(self, finished: Mapping[int, Mapping[str, Any]]) -> str:
         """What was said of the trial before, which Undo would take back."""
@@ -235,9 +238,9 @@ class RobotRun:
         buttons = ("success", "failure", "end", *(("takeover", "handback") if self.teleop else ()))
         self.console.show(
             "running",
-            f"Policy {trial.code} runs. Keep your hands away.",
+            f"{self._title(trial)}: the policy runs. Keep your hands away.",
             buttons,
-            {"point": point.id, "code": trial.code, "limit_s": point.time_limit_s},
+            {"instruction": point.scenario.task.instruction, "limit_s": point.time_limit_s},
         )
         wall, steady = time.time(), time.monotonic()
         try:
@@ -279,7 +282,8 @@ class RobotRun:
             self.say(f"trial {trial.order + 1}: {record['problem']}")
             return
         early = record["button"] if record["button"] in ("success", "failure") else ""
-        said = Answer(early) if early else self._verdict(trial, record["episode"] if again else None)
+        said = Answer(early) if early else self._verdict(trial, record, again)
+        self.console.release()
         note = said.values.get("note", "")[:2000]
         if said.button == "invalid":
             reason = said.values.get("reason", "other")
@@ -291,21 +295,23 @@ class RobotRun:
         self.journal.finish(trial.order, row)
         self.say(f"trial {trial.order + 1}: {said.button}")
 
-    def _verdict(self, trial: PlannedTrial, episode: int | None) -> Answer:
+    def _verdict(self, trial: PlannedTrial, record: Mapping[str, Any], again: bool) -> Answer:
         from lerobot_roborecover.robot.episodes import Episodes
         from lerobot_roborecover.robot.rate import Recording
 
-        text, pictures = f"{self._title(trial)}: is the task done?", LivePictures(self.robot, self.console)
-        if episode is not None:
+        ended = {"time": "Time is up. ", "stop": "You stopped it. "}.get(record["ended"], "")
+        text = f"{ended}{self._title(trial)}: is the task done?"
+        pictures: Callable[[], None] = LivePictures(self.robot, self.console)
+        if again and record["episode"] is not None:
             text = f"{self._title(trial)}, recorded: was the task done at its end?"
-            pictures = Recording(self.console, Episodes(dataset_folder(self.config.folder)), episode)
+            episodes = Episodes(dataset_folder(self.config.folder))
+            pictures = Recording(self.console, episodes, record["episode"])
         return self.console.ask(
             "verdict",
             text,
             ("success", "failure", "invalid"),
             {
                 "instruction": self._by_id[trial.point].scenario.task.instruction,
-                "code": trial.code,
                 "reasons": list(REASONS),
             },
             pictures,

@@ -88,6 +88,13 @@ class RunJournal:
         waiting = [record for order, record in rollouts.items() if order not in done]
         return waiting[-1] if waiting else None
 
+    def cut_off(self) -> int | None:
+        """The trial whose rollout was under way when the run was cut off; None where there is none."""
+        if not self._journal.records or self._journal.records[-1]["kind"] != "restored":
+            return None
+        record = self._journal.records[-1]
+        return None if record["reason"] or record["order"] in self.rows() else int(record["order"])
+
     def external(self) -> dict[str, int]:
         """The trial's place by the name that another program has given it (`RunConfig.external`)."""
         records = self._journal.records

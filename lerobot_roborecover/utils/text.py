@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Collection, Iterable, Sequence
+from functools import cache
+from urllib.parse import unquote, urlsplit
+
+DISTRIBUTION = "lerobot_env_roborecover"
 
 # tqdm's, with and without a total; other output may begin right behind one.
 _PROGRESS_BAR = re.compile(r"[^\r\n]*?(?:\d+%\|[^\r\n]*?|\b\d+it )\[[^\]\r\n]*\]")
@@ -33,6 +38,26 @@ def next_command(argv: Sequence[str], what: str = "next") -> str:
         what: the line's beginning.
     """
     return f"{what}: roborecover {shlex.join(argv)}"
+
+
+@cache
+def install_command(extra: str, name: str = DISTRIBUTION) -> str:
+    """The command that installs an extra of a package from where the package came: a clone, or PyPI.
+
+    Args:
+        extra: its name; empty for the package itself.
+        name: of the distribution.
+    """
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    extras = f"[{extra}]" if extra else ""
+    try:
+        source = json.loads(distribution(name).read_text("direct_url.json") or "{}")
+    except (PackageNotFoundError, ValueError):
+        source = {}
+    if source.get("dir_info", {}).get("editable"):
+        return f"uv pip install -e '{unquote(urlsplit(source['url']).path)}{extras}'"
+    return f"pip install '{name}{extras}'"
 
 
 def align(rows: Iterable[Sequence[object]], left: Collection[int] = (0,)) -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.utils.options import internal, option
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.workers.messages import SlotFailure
 
 if TYPE_CHECKING:
@@ -70,8 +71,7 @@ class Backend:
             raise OptionError(f"{self.option('engine')}={self.engine}: not one of {list(ENGINES)}")
         if self.on_cluster and importlib.util.find_spec("ray") is None:
             raise OptionError(
-                f"{self.option('engine')}=ray: Ray is not installed. pip install "
-                "'lerobot_env_roborecover[ray]', on every node"
+                f"{self.option('engine')}=ray: Ray is not installed. {install_command('ray')}, on every node"
             )
 
     def allocate_workers(

@@ -16,6 +16,7 @@ from typing import Any
 from lerobot_roborecover._version import __version__
 from lerobot_roborecover.errors import OptionError, RoboRecoverError
 from lerobot_roborecover.platforms.versions import installed, required
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.workers.backend import Backend, WorkerStartup
 from lerobot_roborecover.workers.messages import Reply, SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
@@ -24,9 +25,7 @@ try:
     import ray
     from ray.exceptions import RayError, RayTaskError
 except ImportError as err:
-    raise OptionError(
-        f"engine=ray: Ray cannot be imported ({err}). pip install 'lerobot_env_roborecover[ray]'"
-    ) from err
+    raise OptionError(f"engine=ray: Ray cannot be imported ({err}). {install_command('ray')}") from err
 
 MOST_OPENINGS = 3
 """How often in a row an actor may fail to open: a node may go while it starts, but not every time."""

@@ -100,6 +100,7 @@ def test_the_page_needs_nothing_but_itself(written):
         assert re.search(r'alt="[^"]{10,}"', image)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_same_logs_give_the_same_files(written, tmp_path):
     results, _, out = written

@@ -76,6 +76,7 @@ def shown(page):
     )
 
 
+@pytest.mark.nightly
 def test_every_figure_is_drawn(page):
     page.evaluate("document.querySelectorAll('#cards img').forEach(image => image.loading = 'eager')")
     page.evaluate("Promise.all(Array.from(document.images).map(image => image.decode()))")

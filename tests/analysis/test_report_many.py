@@ -45,6 +45,7 @@ def test_pairs_that_are_drawn_and_dealt_are_bounded(tmp_path, monkeypatch, polic
         assert f"Only {best} against every other policy, of {pairs} pairs." in profiles.notes
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_figures_show_the_best_and_say_so(tmp_path):
     """120 rows, columns and lines cannot be read, and took a minute of processor time to lay out."""

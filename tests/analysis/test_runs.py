@@ -204,6 +204,7 @@ def test_the_bootstrap_draws_runs_units_and_trials():
     assert np.isnan(one.low)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_commands(tmp_path, capsys):
     logs = [method(tmp_path, "a", (0.8, 0.6)), method(tmp_path, "b", (0.2, 0.3))]

@@ -100,6 +100,7 @@ def shown(page):
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_two_policies_side_by_side(space, tmp_path):
     out, _, scenarios = space

@@ -14,6 +14,7 @@ def _benchmarks(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_both_ways_show_the_same():
     from observed_steps import measure

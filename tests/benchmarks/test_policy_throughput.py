@@ -62,6 +62,7 @@ def test_every_batch_is_timed_and_means_something(kind, changes, monkeypatch, ca
     assert result["meaning"]["policy_minutes"] == pytest.approx(30_000 / best / 60)
 
 
+@pytest.mark.nightly
 def test_a_batch_that_does_not_fit_ends_the_series(monkeypatch):
     import policy_throughput
     import torch

@@ -175,6 +175,7 @@ def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, c
     assert {s.id for s in read_scenarios(tmp_path / "joined")} == ids
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_kills_lose_nothing(screened, scenario_set, checkpoints, tmp_path, monkeypatch):
     from tests.support.push_checkpoints import load_push_host

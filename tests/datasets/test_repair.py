@@ -156,6 +156,7 @@ def test_a_scenario_twice_is_refused(sources, tmp_path):
         repair(tmp_path / "twice", [str(sources / "a")])
 
 
+@pytest.mark.nightly
 def test_trajectory_datasets_are_repaired_too(tmp_path):
     from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

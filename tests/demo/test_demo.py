@@ -147,6 +147,7 @@ def test_a_finished_demo_runs_nothing_again(settings):
     assert len(read_trial_log(settings().trial_log)) == 24
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_failed_run_shows_the_end_of_its_output_and_goes_on_when_rerun(settings, capsys):
     with pytest.raises(

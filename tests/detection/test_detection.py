@@ -119,6 +119,7 @@ def test_numbers_page_and_strips(measured):
     assert saved["threshold"] == pytest.approx(found["knn"]["conformal_threshold"], abs=1e-5)
 
 
+@pytest.mark.nightly
 def test_a_rerun_looks_at_nothing_twice(dataset, policy, tmp_path, played, monkeypatch):
     from lerobot_roborecover.detection import trials
 
@@ -200,6 +201,7 @@ def forks(dataset, policy, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 def test_an_expected_gain_is_learned_from_forks(dataset, policy, forks, tmp_path, played, capsys):
     """Of what was seen at the forks alone; what is saved never steps in where harm is expected."""
     gain = ("gain=recovery_gain,steps=300", "elapsed")

@@ -232,6 +232,7 @@ def forked(policies, logs, kind, out, arms=(), **options):
 MEASURED = {"finished_at", "handoff_s", "sim_s", "policy_s", "handoff_from_snapshot"}
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 @pytest.mark.slow
 def test_a_deterministic_policys_continuations_are_taken_from_the_log(policies, logs, tmp_path, capsys):

@@ -43,6 +43,7 @@ def shell():
         yield step.get("run", "").replace("bash -c '", "\n").replace("eval-artifacts'", "eval-artifacts")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_evaluation_is_one():
     found = [words for code in shell() for words in commands(code, "lerobot-eval")]

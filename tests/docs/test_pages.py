@@ -80,7 +80,11 @@ def test_python_is_python_and_its_imports_are_there(block):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "block",
-    [b for b in PYTHON if not b.why_not_run and not b.page.startswith(RUN_ELSEWHERE)],
+    [
+        pytest.param(b, marks=[pytest.mark.nightly] if b.page == "README.md" else [])  # half a minute
+        for b in PYTHON
+        if not b.why_not_run and not b.page.startswith(RUN_ELSEWHERE)
+    ],
     ids=named,
 )
 def test_python_runs(block, tmp_path, monkeypatch):

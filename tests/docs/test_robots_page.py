@@ -25,5 +25,7 @@ def test_the_whole_evening_runs_on_the_simulated_lab(environment, tmp_path):  # 
         text=True,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
-    assert len((tmp_path / "run/trials.jsonl").read_text().splitlines()) == 12
-    assert (tmp_path / "report/report.html").exists()
+    out = tmp_path / "outputs/lab"
+    assert len((out / "run/trials.jsonl").read_text().splitlines()) == 32
+    assert (out / "report/report.html").exists()
+    assert "is separated from the other policy" in done.stdout, "the evening ends with a verdict"

@@ -14,6 +14,7 @@ from lerobot_roborecover.doctor import machine, software, sources
 from lerobot_roborecover.platforms import probe, versions
 from lerobot_roborecover.platforms.findings import Check, Status, format_report, report_json
 from lerobot_roborecover.platforms.libero import PLATFORM
+from lerobot_roborecover.utils.text import install_command
 from tests.support.processes import PATIENCE_S
 
 
@@ -61,7 +62,7 @@ def test_a_missing_platform_fails_only_when_asked_for(installed, required, statu
         ("robosuite", status),
         ("hf-libero", status),
     ]
-    assert all(c.remedy == "pip install 'lerobot_env_roborecover[libero]'" for c in missing)
+    assert all(c.remedy == install_command("libero") for c in missing)
     assert len(versions.version_problems("libero")) == 2
 
 

@@ -113,6 +113,7 @@ def test_the_same_rows_as_lerobot_eval(run, whole, capsys, monkeypatch):
     assert "from initial states" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 def test_real_time_is_the_same_under_lerobot_eval(run, whole, dataset, policy, tmp_path):
     """A policy that is asked step by step, four actions an inference."""
     slow = ("--env.realtime=true", "--env.latency_s=0.1")
@@ -133,6 +134,7 @@ def test_a_rerun_repeats_nothing(run, whole):
     assert log.read_bytes() == full
 
 
+@pytest.mark.nightly
 def test_shards_come_together(run, whole, tmp_path, capsys):
     logs = [str(run(f"--shard={k}/2", out=f"s{k}") / "trials.jsonl") for k in range(2)]
     assert "incomplete: 2 of 4 scenarios; shard 0/2 is missing" in capsys.readouterr().out
@@ -157,6 +159,7 @@ def test_sequential_alone_and_against_a_log(run, whole, capsys):
     assert "a part cannot decide for the whole" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 def test_a_time_limit_stops_cleanly_and_says_how_to_go_on(run, whole, capsys):
     slow = "--env.step_s=0.02"
     out = run(slow, "--limit-seconds=3")

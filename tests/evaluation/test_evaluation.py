@@ -130,6 +130,7 @@ def test_on_meta_world(tmp_path):
     assert [(r.outcome, r.steps, r.handoff_identical) for r in rows] == [("horizon", 6, True)]
 
 
+@pytest.mark.nightly
 def test_the_example_runs_without_an_account(capsys):
     main = runpy.run_path(str(EXAMPLE))["main"]
     (logged,) = main(["--steps", "1", "--eval-freq", "1", "--scenarios", "1", "--horizon", "3"])

@@ -155,6 +155,7 @@ def test_a_scenario_that_keeps_breaking_is_parked(tmp_path):
     assert Counter(r.reason.startswith("not tried") for r in rows)[True] >= 2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_hung_simulator_becomes_a_timeout(tmp_path):
     root = write_scenarios(

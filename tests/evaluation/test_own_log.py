@@ -96,6 +96,7 @@ def test_a_demo_of_another_policy_takes_another_folder(checkpoint, tmp_path):
         claim_folder(settings)
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_screening_runs_a_changed_policy_again_and_shows_it_alone(tmp_path):
     dataset = fake_dataset(tmp_path / "set", 2, horizon=6)

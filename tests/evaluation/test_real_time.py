@@ -180,6 +180,7 @@ def frozen(dataset, tmp_path_factory):
     return engine(dataset, tmp_path_factory.mktemp("frozen") / "log.jsonl")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_no_latency_is_a_frozen_clock(dataset, frozen, tmp_path):
     for during_inference in ("hold", "chunk"):

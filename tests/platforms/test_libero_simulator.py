@@ -313,6 +313,7 @@ def test_robosuites_horizon_scores_no_success(sim):
     assert not sim.succeeded()
 
 
+@pytest.mark.nightly
 def test_control_modes(sim):
     task, reset = task_of("libero_goal", 3), Reset(seed=7, init_state_index=0)
     sim.reset(task, reset)

@@ -127,6 +127,7 @@ print(s.state_sha256())
     assert fresh == state
 
 
+@pytest.mark.nightly
 def test_contact_solves_the_task_and_a_miss_does_not(simulator, solved):
     simulator.reset(STACK, Reset(seed=3))
     for action in solved:

@@ -123,6 +123,7 @@ def test_other_starts_other_seeds_and_other_tasks_leave_no_trace(name):
 
 
 @pytest.mark.render
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SETS)
 def test_rendering_changes_nothing(name):
     scenario = load_scenarios(name)[1]

@@ -117,6 +117,7 @@ def test_a_mapping_of_another_protocol_is_refused(example):
         RecoveryBenchmark(mapping="openpi_libero")
 
 
+@pytest.mark.nightly
 @pytest.mark.metaworld
 def test_metaworld_in_the_harness(example, tmp_path):
     (tmp_path / "meta.yaml").write_text(

@@ -27,6 +27,7 @@ def vote(step: int, verdict: str = "recovery", **values) -> dict:
     }
 
 
+@pytest.mark.nightly
 def test_votes_of_several_raters_become_points(tmp_path, capsys):
     from lerobot_roborecover.robot.annotate import write_episodes
     from lerobot_roborecover.robot.capture import capture

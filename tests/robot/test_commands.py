@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import sys
+from itertools import count
 
 import pytest
 
@@ -78,7 +79,7 @@ def test_a_pedal_is_a_key_of_the_terminal(monkeypatch, capsys):
     from lerobot_roborecover.robot.console import Console
 
     keyboard, terminal = os.openpty()
-    console = Console()
+    console = Console(seconds=count(0.0, 10.0).__next__)  # no key is pressed at once
     console.show("capturing", "", ("mark", "end"))
     with os.fdopen(terminal) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)

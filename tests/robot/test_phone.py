@@ -71,7 +71,10 @@ def test_what_is_pressed_reaches_the_run_and_the_truth_of_the_lab_does_not_reach
             pass
         assert state["details"] == {"code": "A"}
         assert user.post("api/press", json={"button": "done"}).status_code == 409
-        user.post("api/press", json={"button": "invalid", "reason": "person", "note": "a hand"})
+        pressed = {"button": "invalid", "reason": "person", "note": "a hand"}
+        for odd in (None, "1", state["version"] - 1, state["version"] + 1):
+            assert user.post("api/press", json={**pressed, "version": odd}).status_code == 409
+        user.post("api/press", json={**pressed, "version": state["version"]})
         asked.join(10)
         assert said[0].button == "invalid"
         assert said[0].values == {"reason": "person", "note": "a hand"}
@@ -79,6 +82,40 @@ def test_what_is_pressed_reaches_the_run_and_the_truth_of_the_lab_does_not_reach
         assert console.stopped
         assert user.post("api/leave", json={}).status_code == 200
     assert not console.phone_gone
+
+
+def test_a_second_tap_does_not_answer_the_next_screen(served):
+    """Both screens have a Go: the second tap must not say that hands are away."""
+    console, phone, _ = served
+    said = []
+    asked = threading.Thread(
+        target=lambda: said.extend(console.ask(name, "?", ("go", "skip")) for name in ("next", "clear"))
+    )
+    asked.start()
+    with client(phone) as user:
+        user.post("api/enter", json={"code": phone.door.code})
+        while (first := user.get("api/state").json())["name"] != "next":
+            pass
+        tap = {"button": "go", "version": first["version"]}
+        assert user.post("api/press", json=tap).status_code == 200
+        while (second := user.get("api/state").json())["name"] != "clear":
+            pass
+        assert user.post("api/press", json=tap).status_code == 409
+        assert len(said) == 1
+        user.post("api/press", json={"button": "skip", "version": second["version"]})
+        asked.join(10)
+    assert [answer.button for answer in said] == ["go", "skip"]
+
+
+def test_a_key_pressed_at_once_was_meant_for_the_screen_before():
+    now = [0.0]
+    console = Console(seconds=lambda: now[0])
+    console.show("clear", buttons=("go",))
+    assert not console.press_key("go")
+    assert console.press_key("stop")
+    now[0] = 1.0
+    assert console.press_key("go")
+    assert console.poll().button == "go"
 
 
 def test_a_phone_that_does_not_ask_any_more_is_gone():
@@ -158,7 +195,7 @@ def test_the_ghost_and_the_buttons_in_a_browser(served):
         assert page.inner_text("#problems") == error["problems"][0]
         page.click("text=edges")
         _fits(page)
-        page.click("#buttons [data-name=done]")
+        page.dblclick("#buttons [data-name=done]")
         page.wait_for_selector("#buttons [data-name=invalid]")
         page.wait_for_selector("#cameras img[src*='/live']")
         _fits(page)
@@ -180,16 +217,20 @@ def _fits(page):
     assert last["y"] + last["height"] <= 800
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_a_rater_sees_where_a_recording_ends_and_nothing_to_stop(served):
     console, phone, _ = served
-    picture, moment = np.full((48, 48, 3), 90, np.uint8), [1]
+    picture, moment, said = np.full((48, 48, 3), 90, np.uint8), [1], []
 
     def look():
         console.update(moment=moment[0], moments=3)
         console.pictures = {"top": (picture, picture)}
 
-    asked = threading.Thread(target=lambda: console.ask("rate", "Done at its end?", ("success",), {}, look))
+    def run():
+        said.extend(console.ask("rate", f"Trial {k}", ("success", "failure"), {}, look) for k in (1, 2))
+
+    asked = threading.Thread(target=run)
     asked.start()
     with browsing() as visit:
         page, _complaints = visit(phone.address)
@@ -200,6 +241,9 @@ def test_a_rater_sees_where_a_recording_ends_and_nothing_to_stop(served):
         page.keyboard.press("Space")
         moment[0] = 3
         page.wait_for_selector("text=top: the end")
-        page.click("#buttons [data-name=success]")
+        page.dblclick("#buttons [data-name=success]")
+        page.wait_for_selector("text=Trial 2")
+        page.click("#buttons [data-name=failure]")
         asked.join(20)
+    assert [answer.button for answer in said] == ["success", "failure"]
     assert not console.stopped

@@ -205,8 +205,7 @@ def test_undo_asks_again_and_the_log_follows_the_journal(made, tmp_path, monkeyp
         monkeypatch.setattr(Console, "show", keep)
         rows, lines = go(made, tmp_path, robot, spoken)
     first, again = asked["verdict"]
-    assert first.startswith("Trial 1 of 4, policy ")
-    assert first.endswith(": is the task done?")
+    assert first == "Trial 1 of 4: is the task done?"
     assert again.endswith(", recorded: was the task done at its end?")
     assert asked["next"][1].endswith(" Trial 1: failure.")
     assert "trial 1: taken back" in lines
@@ -250,6 +249,43 @@ def test_after_a_crash_before_the_verdict_only_the_verdict_is_asked(made, tmp_pa
         rows, lines = go(made, tmp_path, robot, Spoken(operator, **said))
     assert [r.outcome for r in rows] == ["success"]
     assert "has no verdict yet" in lines[0]
+
+
+def test_after_the_last_trial_its_verdict_can_still_be_taken_back(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    said = {
+        "running": [Answer("end")] * 4,
+        "verdict": [Answer("failure")] * 4 + [Answer("success")],
+        "finished": [Answer("undo"), Answer("finish")],
+    }
+    with lab(made) as robot:
+        operator = Spoken(SimulatedOperator(robot, sd_mm=0.0), **said)
+        rows, lines = go(made, tmp_path, robot, operator)
+    assert [r.success for r in rows] == [False, False, False, True]
+    assert said["finished"] == []
+    assert lines[-3:-1] == ["trial 4: taken back", "trial 4: success"]
+
+
+def test_a_trial_that_was_cut_off_is_said_and_run_again(made, tmp_path):
+    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
+
+    class Killed(BaseException):
+        pass
+
+    class Kills(Spoken):
+        def answer(self, screen, details):
+            if screen == "running":
+                raise Killed
+            return super().answer(screen, details)
+
+    with lab(made) as robot:
+        operator = SimulatedOperator(robot, sd_mm=0.0)
+        with pytest.raises(Killed):
+            go(made, tmp_path, robot, Kills(operator))
+        rows, lines = go(made, tmp_path, robot, operator, stop_after=1)
+    assert lines[0] == "trial 1 was cut off before it ended; it is run again"
+    assert len(rows) == 1
 
 
 def test_a_button_that_ended_a_trial_is_its_verdict_until_it_is_taken_back(made, tmp_path):

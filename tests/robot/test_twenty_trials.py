@@ -51,6 +51,8 @@ class Person:
             self.press("undo")
         elif screen in ("next", "clear"):
             self.press("go")
+        elif screen == "finished":
+            self.press("finish")
         elif screen == "confirm":
             self.press("yes")
         elif screen == "place":

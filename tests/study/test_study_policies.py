@@ -112,6 +112,7 @@ def test_training_from_memory_is_training(name, demonstrations, tmp_path, monkey
         np.testing.assert_array_equal(value, weights[1][key], err_msg=key)
 
 
+@pytest.mark.nightly
 def test_every_config_is_a_policy_s():
     import draccus
     from lerobot.configs.train import TrainPipelineConfig

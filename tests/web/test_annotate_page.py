@@ -171,6 +171,7 @@ def test_a_reload_in_the_middle_of_an_episode_keeps_marks_and_place(server, visi
     assert shown(page, 10) == [10, 10]
 
 
+@pytest.mark.nightly
 def test_a_killed_server_loses_no_vote(dataset, visit, tmp_path):
     with annotating(dataset, tmp_path, "ann") as (process, addresses):
         page, _ = visit(addresses["ann"])
@@ -201,6 +202,7 @@ def test_a_killed_server_loses_no_vote(dataset, visit, tmp_path):
         assert page.inner_text("#done") == "2"
 
 
+@pytest.mark.nightly
 def test_scrubbing_among_a_thousand_episodes_asks_the_server_for_nothing(server, visit):
     """All frames of the episode at hand lie in the page: what a key costs does not depend on the queue."""
     page, said = visit(server["eve"])

@@ -74,6 +74,7 @@ def test_the_page_shows_what_the_steps_say(tmp_path, monkeypatch):
     compare(candidate_dataset(tmp_path / "rollouts", 2), tmp_path, ["auto-1"])
 
 
+@pytest.mark.nightly
 def test_every_row_of_the_readout_is_read(tmp_path, monkeypatch):
     """Grippers, goals and speeds of objects, which the toy has not; and numbers in the middle of two."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))

@@ -164,6 +164,7 @@ def test_a_person_drives_marks_reloads_and_saves_and_a_killed_server_loses_nothi
     assert len(recordings(out)) == 1
 
 
+@pytest.mark.nightly
 def test_answers_stand_beside_the_picture_and_buttons_work_without_a_mouse(visit, out):
     with driving(out, "--task=push-left") as (_process, address):
         page, said = visit(address)
@@ -195,6 +196,7 @@ def test_answers_stand_beside_the_picture_and_buttons_work_without_a_mouse(visit
         assert said == []
 
 
+@pytest.mark.nightly
 def test_a_second_page_watches_at_once_and_takes_the_wheel(visit, out):
     with driving(out, "--task=push-left") as (_process, address):
         first, _ = visit(address)
@@ -213,6 +215,7 @@ def test_a_second_page_watches_at_once_and_takes_the_wheel(visit, out):
         assert said == []
 
 
+@pytest.mark.nightly
 def test_a_wrong_address_gets_a_page_for_people(visit, out):
     with driving(out, "--task=push-left") as (_process, address):
         origin = address.split("/drive")[0]
@@ -234,6 +237,7 @@ PAD = """() => {
 }"""
 
 
+@pytest.mark.nightly
 def test_a_gamepad_drives(visit, out):
     with driving(out, *STARTS, "--rate=10") as (_process, address):
         page, said = visit(address)

@@ -8,6 +8,7 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 from lerobot_roborecover.workers.slots import SlotPool, WorkerSlot
 from tests.support.shipped_policies import CHECKPOINT
@@ -38,7 +39,7 @@ def test_another_engine_or_no_ray_is_refused_before_anything_starts(
         importlib.util, "find_spec", lambda name, *a: None if name == "ray" else there(name, *a)
     )
     assert main([command, *words, "--engine=ray"]) == 2
-    assert "Ray is not installed. pip install 'lerobot_env_roborecover[ray]'" in capsys.readouterr().err
+    assert f"Ray is not installed. {install_command('ray')}, on every node" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

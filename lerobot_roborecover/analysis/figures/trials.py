@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.figures import style
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import of_robots, outcome_words
 from lerobot_roborecover.analysis.stats.crossfit import Oracle, oracle
 from lerobot_roborecover.analysis.stats.timing import budget_estimates
 from lerobot_roborecover.scenario import Outcome
@@ -150,6 +151,7 @@ def mosaic(results: Results) -> style.Figure:
 
     arms = results.arms[: 2 * style.MOST_ROWS]  # of both starts
     kinds = [kind for kind in Outcome if any(r.outcome == kind for a in arms for r in a.rows)]
+    robots = of_robots(results)
     counts = [Counter(row.outcome for row in arm.rows) for arm in arms]
     share = np.array([len(arm.rows) for arm in arms], float)
     share = np.maximum(share / share.max(), 0.25)
@@ -196,7 +198,7 @@ def mosaic(results: Results) -> style.Figure:
                     fc=_FILLS[k][0],
                     ec=style.SOFT,
                     hatch=_FILLS[k][1],
-                    label=k.value.replace("_", " ") + ("" if k.valid else " (invalid)"),
+                    label=outcome_words(k, robots) + ("" if k.valid else " (invalid)"),
                 )
                 for k in kinds
             ]
@@ -205,7 +207,7 @@ def mosaic(results: Results) -> style.Figure:
 
     text = "; ".join(
         f"{arm.policy} from {arm.start.value}: "
-        + ", ".join(f"{count[k.value]} {k.value}" for k in kinds if count[k.value])
+        + ", ".join(f"{count[k.value]} {outcome_words(k, robots)}" for k in kinds if count[k.value])
         for arm, count in zip(arms, counts, strict=True)
     )
     if len(arms) < len(results.arms):

@@ -250,11 +250,12 @@ def _image_uri(data: bytes | str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def gallery_values(cards: Sequence[Card]) -> dict[str, Any]:
+def gallery_values(cards: Sequence[Card], robots: bool = False) -> dict[str, Any]:
     """What the gallery's template asks for.
 
     Args:
         cards: of `make_cards`.
+        robots: their trials are of robots.
     """
     present = {kind for card in cards for kind in card.outcome_classes}
     policies = list(dict.fromkeys(mark.policy for card in cards for mark in card.marks))
@@ -266,6 +267,7 @@ def gallery_values(cards: Sequence[Card]) -> dict[str, Any]:
         },
         "outcome_classes": {k: v for k, v in OUTCOME_CLASSES.items() if k in present},
         "signs": SIGNS,
+        "robots": robots,
         "untold": sum(not card.trials for card in cards),
         "policies": policies,
     }

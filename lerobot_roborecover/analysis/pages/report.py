@@ -32,6 +32,7 @@ from lerobot_roborecover.analysis.pages.page import (
 from lerobot_roborecover.analysis.pages.trial_details import action_folders
 from lerobot_roborecover.analysis.report_tables import all_tables
 from lerobot_roborecover.analysis.results import Results
+from lerobot_roborecover.analysis.robot_tables import of_robots
 from lerobot_roborecover.analysis.stats.intervals import Estimate
 from lerobot_roborecover.analysis.stats.units import ESTIMAND
 from lerobot_roborecover.analysis.tables import Cell, Table, to_csv, to_latex, to_markdown
@@ -43,7 +44,7 @@ REPORT_FILES = ("report.html", "report.md", "results.json", "figures", "tables")
 
 _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("overall", "forest", ("overall",)),
-    ("starts", "", ("robot_starts", "robot_slopes")),
+    ("starts", "", ("robot_starts", "robot_slopes", "robot_raters")),
     ("runs", "runs", ("methods", "runs", "method_contrasts")),
     ("ranks", "", ("ranks", "inversions")),
     ("differences", "paired_differences", ("contrasts", "profiles")),
@@ -278,7 +279,7 @@ def _html(
         introduction=extras.introduction,
         remarks=grouped(remarks, [*heads, *results.study.policies]),
         sections=sections,
-        **gallery_values(cards),
+        **gallery_values(cards, of_robots(results)),
         commands=[without_folders(command) for command in extras.commands],
         provenance=json.dumps(provenance, indent=1),
     )

@@ -94,15 +94,29 @@
     const more = Object.entries(rest).map(([name, value]) => words(name) + " " + value).join(", ");
     return kind + " at step " + step + (more ? " (" + more + ")" : "");
   };
+  const ON_ROBOTS = { horizon: "failure", sim_error: "equipment, or called invalid", state_mismatch: "start too far off" };
+  const ending = (row) => (row.robot && ON_ROBOTS[row.outcome]) || words(row.outcome);
+  const startError = (error) => {
+    if (!error) return "not measured";
+    const joints = Math.max(...Object.values(error.joints).map(Math.abs), 0);
+    const cameras = Object.entries(error.cameras).map(([name, one]) => name + ": "
+      + [["camera", one.background_px], ["objects", one.object_px]].filter(([, value]) => value !== null)
+        .map(([what, value]) => what + " " + value.toFixed(1) + " px").join(", ") + (one.moving ? " (on the arm)" : ""));
+    return ["worst joint " + joints.toFixed(2), ...cameras].join("; ");
+  };
   const facts = (trial, row) => {
-    const found = [["Outcome", words(row.outcome) + " after " + row.steps + " of " + row.horizon + " steps"]];
+    const found = [["Outcome", ending(row) + " after " + row.steps + " of " + row.horizon + " steps"]];
     if (row.reason) found.push(["Reason", row.reason]);
-    found.push(["Handoff", row.handoff_eef_error_mm === null && row.handoff_object_error_mm === null
+    if (row.robot) {
+      found.push(["Start error", startError(row.robot.start_error)]);
+      found.push(["Verdict", row.robot.verdict + (row.robot.note ? ": " + row.robot.note : "")]);
+      if (row.robot.episode !== null) found.push(["Recording", "episode " + row.robot.episode + " of the run's dataset"]);
+    } else found.push(["Handoff", row.handoff_eef_error_mm === null && row.handoff_object_error_mm === null
       ? (row.start === "recovery" ? "not in this log" : "none: the task's own start")
       : "step " + row.handoff_step + "; end effector " + mm(row.handoff_eef_error_mm) + ", objects " + mm(row.handoff_object_error_mm)
         + " off" + (row.handoff_identical ? "; the state is identical" : "")]);
     found.push(["Interventions", row.interventions.length ? row.interventions.map(intervention).join("; ") : "none"]);
-    if (!trial.actions) found.push(["Actions", "not recorded (--env.record_actions=true records them)"]);
+    if (!trial.actions && !row.robot) found.push(["Actions", "not recorded (--env.record_actions=true records them)"]);
     return found.flatMap(([name, text]) => {
       const term = document.createElement("dt");
       const fact = document.createElement("dd");
@@ -131,7 +145,7 @@
     const row = { ...data.shared, ...trial.row };
     open = { card, data, number };
     const from = trial.start === "initial" ? "the initial state" : "the recovery point";
-    part("title").textContent = trial.policy + ", trial " + (trial.index + 1) + ": " + (row.success ? "solved" : words(row.outcome));
+    part("title").textContent = trial.policy + ", trial " + (trial.index + 1) + ": " + (row.success ? "solved" : ending(row));
     part("about").textContent = row.instruction + ". " + row.scenario_id + ", from " + from + ".";
     const view = seen(card, trial, row);
     part("seen").replaceChildren(...(view ? [view] : []));

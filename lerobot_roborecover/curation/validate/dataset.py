@@ -41,7 +41,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.scenario import Scenario, ScenarioError
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_write, check_new
 from lerobot_roborecover.utils.journal import Journal
-from lerobot_roborecover.utils.text import next_command
+from lerobot_roborecover.utils.text import install_command, next_command
 from lerobot_roborecover.workers.jobs import Done, JobPool, Outcome
 from lerobot_roborecover.workers.messages import SlotFailure
 
@@ -78,8 +78,8 @@ def validate_dataset(
     check_replaceable(request.out)
     if request.rule.frames and importlib.util.find_spec("skimage") is None:
         raise OptionError(
-            "frames are compared with scikit-image, which is not installed: pip install "
-            "'lerobot_env_roborecover[build]', or go without: --no-frames"
+            "frames are compared with scikit-image, which is not installed: "
+            f"{install_command('build')}, or go without: --no-frames"
         )
     scenarios, manifest = read_with_manifest(request.dataset)
     sets = [read_candidates(path) for path in request.candidates]

@@ -13,6 +13,7 @@ import gymnasium as gym
 
 from lerobot_roborecover.platforms.catalog import nearest
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.utils.text import install_command
 
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:[\w./-]+\.py)?")
 
@@ -99,7 +100,7 @@ def _import(package: str) -> None:
             raise
         raise SimulatorError(
             f"the package {package!r} of this env type is not installed. Install it: for LeRobot's own, "
-            "pip install 'lerobot_env_roborecover[gym]'"
+            f"{install_command('gym')}"
         ) from None
 
 

@@ -21,6 +21,7 @@ from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.temporary import TemporaryFolder
+from lerobot_roborecover.utils.text import install_command
 
 ASSETS_VARIABLE = "ROBORECOVER_LIBERO_ASSETS"
 """Environment variable that names the asset folder."""
@@ -57,9 +58,7 @@ def package_root() -> Path:
     """
     spec = importlib.util.find_spec("libero")
     if spec is None or not spec.submodule_search_locations:
-        raise SimulatorError(
-            "LIBERO is not installed. Install it with: pip install 'lerobot_env_roborecover[libero]'"
-        )
+        raise SimulatorError(f"LIBERO is not installed. Install it with: {install_command('libero')}")
     return Path(next(iter(spec.submodule_search_locations))) / "libero"
 
 

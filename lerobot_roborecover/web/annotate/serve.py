@@ -13,6 +13,7 @@ from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.resolution import to_vote_on
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.options import option
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.web.annotate.identity import names_of, queue_order
 from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 
@@ -57,9 +58,7 @@ def serve(config: AnnotateConfig, say: Callable[[str], None]) -> None:
 
         from lerobot_roborecover.web.annotate.server import AnnotationStudy, VotingSession, make_app
     except ImportError as err:
-        raise ScenarioError(
-            f"the page needs {err.name}: pip install 'lerobot_env_roborecover[build]'"
-        ) from None
+        raise ScenarioError(f"the page needs {err.name}: {install_command('build')}") from None
     candidates = read_candidates(config.dataset)
     frames = FramePacks(Videos(config.dataset), [row.steps for row in candidates.trajectories.rows])
     wanted, discussion = to_vote_on(candidates, config.only)

@@ -11,6 +11,7 @@ from lerobot_roborecover.curation.annotation.votes import check_name
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils.options import internal, option
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.web.serve import HOST, kept_tokens, listen, make_server, own_hosts
 from lerobot_roborecover.web.teleop.hub import Hub
 from lerobot_roborecover.web.teleop.simulator_thread import SimulatorThread
@@ -68,9 +69,7 @@ def serve(config: TeleopConfig, say: Callable[[str], None]) -> None:
 
         from lerobot_roborecover.web.teleop.server import NAME, TeleopApp, make_app
     except ImportError as err:
-        raise ScenarioError(
-            f"teleoperation needs {err.name}: pip install 'lerobot_env_roborecover[teleop]'"
-        ) from None
+        raise ScenarioError(f"teleoperation needs {err.name}: {install_command('teleop')}") from None
     platform_named(config.platform).controls()
     check_open(config.dataset)
     operator = check_operator(config.operator)

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.utils.text import install_command
 from lerobot_roborecover.web.teleop.pilot import InputHandler, OperatorCommand
 
 _LOG = logging.getLogger(__name__)
@@ -142,9 +143,7 @@ def find_spacemouse() -> Device:
     try:
         hid = importlib.import_module("hid")
     except ImportError as err:
-        raise ScenarioError(
-            f"a SpaceMouse needs {err.name}: pip install 'lerobot_env_roborecover[teleop]'"
-        ) from None
+        raise ScenarioError(f"a SpaceMouse needs {err.name}: {install_command('teleop')}") from None
     found = [d for d in hid.enumerate() if d["vendor_id"] in VENDORS]
     mice = [d for d in found if (d["usage_page"], d["usage"]) == _MULTI_AXIS]
     mice = mice or [d for d in found if d["vendor_id"] == VENDORS[0]]

@@ -2,10 +2,11 @@
 
 const byId = (id) => document.getElementById(id);
 const VIEWS = ["blend", "difference", "edges", "recorded", "live"];
+const SETTLE_MS = 700;
 const STILL = ["rate", "over"]; // screens without a robot that moves
 const WORDS = {
   go: "Go", skip: "Skip", yes: "Yes", no: "No", done: "Done", success: "Success", failure: "Failure",
-  invalid: "Invalid", undo: "Undo last verdict", pause: "Pause", mark: "Mark: it went wrong", end: "End",
+  invalid: "Invalid", undo: "Undo last verdict", pause: "Pause: end here, go on later", finish: "Finish", mark: "Mark: it went wrong", end: "End",
   takeover: "Take over", handback: "Hand back",
 };
 let view = "blend";
@@ -39,12 +40,20 @@ async function enter(takeOver) {
   }
 }
 
-async function press(button) {
+function settle() {
+  for (const made of byId("buttons").children) {
+    made.disabled = true;
+    setTimeout(() => { made.disabled = false; }, SETTLE_MS);
+  }
+}
+
+async function press(button, version) {
+  settle();
   try {
-    await send("press", { button, reason: byId("reason").value, note: byId("note").value });
+    await send("press", { button, version, reason: byId("reason").value, note: byId("note").value });
     complain(null);
   } catch (error) {
-    complain(error);
+    if (error.status !== 409) complain(error); // a second tap, which the next screen does not take
   }
 }
 
@@ -60,8 +69,9 @@ function showScreen(state) {
   document.body.dataset.screen = state.name;
   byId("instruction").textContent = state.details.instruction || "";
   byId("buttons").replaceChildren(
-    ...state.buttons.map((name) => button(name, WORDS[name] || name, () => press(name))),
+    ...state.buttons.map((name) => button(name, WORDS[name] || name, () => press(name, state.version))),
   );
+  settle(); // what is tapped before it can be read was meant for the screen before
   const verdict = state.buttons.includes("invalid");
   byId("note-label").hidden = byId("reason-label").hidden = !verdict;
   byId("note").value = "";
@@ -110,7 +120,8 @@ async function look() {
       const answer = await fetch("api/state");
       const state = await answer.json();
       if (!answer.ok) throw new Error(state.error);
-      const text = state.details.notice || state.text;
+      const clock = state.details.left_s === undefined ? "" : ` ${Math.ceil(state.details.left_s)} s left.`;
+      const text = (state.details.notice || state.text) + clock;
       byId("text").textContent = state.stopped ? `STOPPED. ${state.buttons.length ? text : ""}` : text;
       if (state.version !== shown) showScreen(state);
       shown = state.version;
@@ -129,6 +140,7 @@ async function look() {
     }
   } else {
     byId("text").textContent = "RoboRecover: console of the robot";
+    if (document.body.dataset.screen !== "door") byId("code").value = "";
     document.body.dataset.screen = "door";
   }
   byId("door").hidden = inside;
