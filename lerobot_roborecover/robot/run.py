@@ -137,7 +137,10 @@ class RobotRun:
             self._trial(left[0])
             done += 1
         total = len(self.journal.rows())
-        self.console.show("over", f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done.")
+        text = (
+            f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done. The terminal says what comes next."
+        )
+        self.console.show("over", text)
         self.say(f"{pluralize(total, 'trial')} of {len(self.plan.trials)} in {self.journal.log}")
         return total
 
