@@ -53,6 +53,7 @@ def first(tmp_path_factory):
     return out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_report_of_stored_scores_says_the_same(first, tmp_path, capsys):
     again = tmp_path / "again"

@@ -263,6 +263,7 @@ def test_the_board_does_not_separate_what_holm_does_not(tmp_path):
     ]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_commands_say_the_same(tmp_path, capsys):
     six(tmp_path)

@@ -125,10 +125,10 @@ def test_what_fails_twice_and_then_works_is_published(hub, client, local, method
     ("failure", "words"),
     [
         (["POST", "/repos/create", 403, 9], ["403", "may not do this", "hf auth login"]),
-        (["POST", "/repos/create", 401, 9], ["401", "HF_TOKEN"]),
+        pytest.param(["POST", "/repos/create", 401, 9], ["401", "HF_TOKEN"], marks=pytest.mark.nightly),
         (["POST", "/commit/", 409, 9], ["409", "another commit"]),
-        (["POST", "/commit/", 413, 9], ["413", "refused"]),
-        (["POST", "/tag/", 429, 99], ["429", "slow down"]),
+        pytest.param(["POST", "/commit/", 413, 9], ["413", "refused"], marks=pytest.mark.nightly),
+        pytest.param(["POST", "/tag/", 429, 99], ["429", "slow down"], marks=pytest.mark.nightly),
         (["GET", "/refs", 500, 99], ["did not answer properly after 5 attempts"]),
     ],
 )
@@ -199,7 +199,14 @@ def add_episodes(local, count: int, size: int = 1) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "pattern"), [("PUT", "/lfs/"), ("POST", "/commit/"), ("POST", "/tag/")])
+@pytest.mark.parametrize(
+    ("method", "pattern"),
+    [
+        pytest.param("PUT", "/lfs/", marks=pytest.mark.nightly),
+        ("POST", "/commit/"),
+        pytest.param("POST", "/tag/", marks=pytest.mark.nightly),
+    ],
+)
 def test_a_publication_that_is_killed_shows_nothing_half_and_goes_on(hub, client, local, method, pattern):
     add_episodes(local, 2)
     hold = hub.hold(method, pattern, skip=1 if method == "PUT" else 0)

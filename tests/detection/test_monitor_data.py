@@ -123,6 +123,7 @@ def test_a_scenario_in_both_parts_is_refused(continuations, tmp_path):
         check_disjoint(renamed[:1], renamed[1:], "x")
 
 
+@pytest.mark.nightly
 @pytest.mark.lerobot
 def test_frames_are_the_replay_s_own(continuations, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

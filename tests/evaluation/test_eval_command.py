@@ -122,6 +122,7 @@ def test_real_time_is_the_same_under_lerobot_eval(run, whole, dataset, policy, t
     assert {(r.options["realtime"], r.options["latency_s"]) for r in rows} == {("hold", 0.1)}
 
 
+@pytest.mark.nightly
 def test_a_rerun_repeats_nothing(run, whole):
     log = run() / "trials.jsonl"
     before = log.read_bytes()

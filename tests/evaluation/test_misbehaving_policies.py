@@ -104,10 +104,21 @@ BAD_CHUNKS = {
 }
 
 
+ASKED = [(bad, False) for bad in BAD_CHUNKS] + [(bad, True) for bad in ("nothing", "one action", "complex")]
+FEW = [
+    ("too few", False),
+    ("nothing", False),
+    ("one action", False),
+    ("an unknown controller", False),
+    ("nothing", True),
+]
+"""What the default run takes of it."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("bad", "realtime"),
-    [(bad, False) for bad in BAD_CHUNKS] + [(bad, True) for bad in ("nothing", "one action", "complex")],
+    [pytest.param(*asked, marks=() if asked in FEW else pytest.mark.nightly) for asked in ASKED],
 )
 def test_a_bad_answer_becomes_policy_errors_in_the_engine(dataset, tmp_path, bad, realtime):
     spoil, words = BAD_CHUNKS[bad]
@@ -132,7 +143,9 @@ def test_a_bad_answer_becomes_policy_errors_in_lerobots_loop(dataset, tmp_path, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i4", "i8", "u1"])
+@pytest.mark.parametrize(
+    "dtype", ["f2", "i8", *(pytest.param(d, marks=pytest.mark.nightly) for d in ("f4", "f8", "i4", "u1"))]
+)
 def test_real_numbers_of_any_size_are_executed(dataset, tmp_path, dtype):
     host = BadHost(lambda chunks: [np.clip(c, 0, 1).astype(dtype) for c in chunks])
     _, rows = run_engine(dataset, tmp_path / "log.jsonl", host)

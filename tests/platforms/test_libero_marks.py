@@ -31,6 +31,7 @@ def test_an_object_that_is_placed_on_another_is_wanted_where_that_one_is(simulat
     assert set(marks[0].removesuffix(GOAL_OF).split()) <= set(poses)
 
 
+@pytest.mark.nightly
 def test_each_of_two_goals_has_its_mark_and_the_traces_show_both(simulator):
     from lerobot_roborecover.platforms.libero.platform import PLATFORM
 

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 pytestmark = [pytest.mark.libero, pytest.mark.lerobot]
 
 
+@pytest.mark.nightly
 def test_every_config_is_a_policy_s(tmp_path):
     import draccus
     import yaml
