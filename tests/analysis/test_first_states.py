@@ -121,6 +121,7 @@ def test_an_old_log_has_its_first_states_from_the_shipped_set(tmp_path):
     assert not [remark for remark in study.remarks if "first state" in remark]
 
 
+@pytest.mark.slow
 def test_an_old_log_of_an_unknown_set_says_so(tmp_path):
     rows = [trial_row(n, start=start) for n in range(12) for start in ("initial", "recovery")]
     study = read_study([str(write_old_log(tmp_path / "old.jsonl", rows))])

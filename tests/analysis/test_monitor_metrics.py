@@ -170,6 +170,7 @@ def test_unknown_threshold_rules_are_refused(noisy, rule):
         choose_threshold(noisy, rule)
 
 
+@pytest.mark.slow
 def test_the_report_holds_the_numbers_in_every_form(noisy, tmp_path):
     measured = [Measured("natural", noisy, monitor_report(noisy))]
     measured.append(Measured("by_hand", frames(BY_HAND), monitor_report(frames(BY_HAND))))

@@ -92,6 +92,7 @@ def test_everything_is_written(written):
     assert not list(out.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_but_itself(written):
     page = written[1].html.read_text()
     assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", page)
@@ -110,6 +111,7 @@ def test_the_same_logs_give_the_same_files(written, tmp_path):
         assert path.read_bytes() == (tmp_path / "again" / "figures" / path.name).read_bytes()
 
 
+@pytest.mark.slow
 def test_seed_and_draws_are_in_every_output(written):
     _, files, out = written
     bootstrap = json.loads(files.results.read_text())["provenance"]["bootstrap"]
@@ -127,6 +129,7 @@ def test_seed_and_draws_are_in_every_output(written):
         assert "500 draws, seed 7" in text
 
 
+@pytest.mark.slow
 def test_numbers_in_json_are_those_of_the_rows(written):
     results, files, _ = written
     overall = json.loads(files.results.read_text())["tables"]["overall"]
@@ -141,6 +144,7 @@ def test_numbers_in_json_are_those_of_the_rows(written):
         assert rsr[policy] == pytest.approx(np.mean(rates)), p
 
 
+@pytest.mark.slow
 def test_the_headline_says_how_sure_both_rates_are(written):
     results, files, _ = written
     best = results.ranked.arms[results.best_first[0]]
@@ -153,6 +157,7 @@ def test_the_headline_says_how_sure_both_rates_are(written):
     )
 
 
+@pytest.mark.slow
 def test_a_policy_without_an_initial_arm_is_told_so(written):
     results, files, _ = written
     assert any(r.startswith("gamma@3: no trials from initial states") for r in results.remarks)
@@ -162,6 +167,7 @@ def test_a_policy_without_an_initial_arm_is_told_so(written):
     assert "ranks" not in {t.name for t in files.tables}, "two policies have both: one pair is no ranking"
 
 
+@pytest.mark.slow
 def test_undefined_numbers_are_explained_in_every_table(written):
     for t in written[1].tables:
         for text in (to_markdown(t), to_csv(t), to_latex(t)):
@@ -170,6 +176,7 @@ def test_undefined_numbers_are_explained_in_every_table(written):
             assert any(note.startswith("n/a: not defined") for note in t.all_notes()), t.name
 
 
+@pytest.mark.slow
 def test_published_rows_stand_beside_and_are_marked(written):
     published = table(written[0], "published")
     origins = [row[1] for row in published.rows]
@@ -186,6 +193,7 @@ def test_published_rows_are_those_of_the_platform(tmp_path):
     assert "published" not in {t.name for t in all_tables(elsewhere)}
 
 
+@pytest.mark.slow
 def test_policies_stand_best_first_everywhere(written):
     results, files, _ = written
     order = list(results.recovery.arms)
@@ -199,6 +207,7 @@ def test_policies_stand_best_first_everywhere(written):
     assert all(row[3].value >= 0 for row in tables["contrasts"].rows)
 
 
+@pytest.mark.slow
 def test_figures_have_a_dark_and_a_narrow_drawing(written):
     out = written[2]
     for name in ("forest", "cells", "paired_differences", "outcomes"):

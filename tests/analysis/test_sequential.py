@@ -105,6 +105,7 @@ def test_a_run_stops_when_its_comparison_is_decided(stopped):
     assert set(first) <= set(record.scenarios[: record.after_scenarios + 2]), "slots run ahead by little"
 
 
+@pytest.mark.slow
 def test_a_rerun_of_a_decided_comparison_runs_nothing(stopped, dataset):
     root, _, rows = stopped
     watch, again = evaluate(dataset, root / "push" / "trials.jsonl", "push@1", PushHost(), str(root / "lazy"))

@@ -37,6 +37,7 @@ def refuse_odd_seeds(simulator, scenario):
     return {"off_mm": float(scenario.reset.seed)}
 
 
+@pytest.mark.slow
 def test_fingerprints_are_those_of_a_replay_whatever_the_workers(tmp_path):
     scenarios = [bare(i) for i in range(12)]
     expected = [fake_scenario(i).fingerprint for i in range(12)]

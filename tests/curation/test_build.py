@@ -138,6 +138,7 @@ def test_a_place_is_no_part_of_what_a_stage_makes(part):
     assert _options(part(engine="ray", ray_address="head:6379")) == _options(part())
 
 
+@pytest.mark.slow
 def test_what_runs_again(stand_in):
     build = stand_in
     with pytest.raises(AwaitingAnnotations, match=r"3 candidates wait for votes \(3 each\)"):

@@ -64,6 +64,7 @@ def test_parts_add_up_and_a_part_never_replaces_the_whole(certified, capsys):
     assert read_certificate(root / "set").whole
 
 
+@pytest.mark.slow
 def test_the_certificate_lists_what_is_not_exact(certified):
     root, _, part, _ = certified
     found = read_certificate(root / "set")

@@ -150,6 +150,7 @@ def test_ids_are_unique_and_fit_whatever_drives():
 # --- records
 
 
+@pytest.mark.slow
 @given(order=st.permutations(range(6)), split=st.integers(0, 6))
 @settings(max_examples=8, deadline=None)
 def test_a_rollout_depends_on_its_start_alone(order, split, tmp_path_factory):
@@ -278,6 +279,7 @@ def test_slots_and_interruption_change_nothing(tmp_path):
     assert contents(tmp_path / "one" / "rollouts") == contents(tmp_path / "two" / "rollouts")
 
 
+@pytest.mark.slow
 def test_a_breaking_simulator_costs_its_rollout_alone(tmp_path):
     made = [*units((0,), tasks=("faults/raises", "faults/exits"), horizon=30), *units((0,))]
     ended = roll(tmp_path, made, 1)

@@ -37,6 +37,7 @@ def bare(tmp_path):
     return root
 
 
+@pytest.mark.slow
 def test_only_the_hash_is_new(bare, tmp_path, capsys):
     assert main(["validate", str(bare), "--states", "--out", str(tmp_path / "out")]) == 0
     assert "4 states, each replayed twice and identical; 4 had no hash" in capsys.readouterr().out
@@ -81,6 +82,7 @@ def test_one_that_does_not_fit_writes_nothing(tmp_path, capsys, change, message)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_two_replays_that_differ_write_nothing(tmp_path, monkeypatch, capsys):
     write_scenarios(tmp_path / "set", [without_hash(fake_scenario(0))])
     real = exactness.replay_logged

@@ -46,6 +46,7 @@ def test_the_card_says_what_is_there_and_its_metadata_is_valid(hub, client, loca
         assert piece in text, piece
 
 
+@pytest.mark.slow
 def test_a_licence_is_asked_for_and_never_invented(hub, client, local):
     done = client.roborecover("publish", local, "--repo-id", REPO)
     assert done.returncode == 2

@@ -64,6 +64,7 @@ def test_moments_are_the_states_before_each_action_and_the_recovery_point(datase
     assert dict(moments[-1].bodies) == dict(scenario.fingerprint.bodies)
 
 
+@pytest.mark.slow
 def test_a_recording_holds_every_step_and_marks_the_recovery_point(dataset, tmp_path):
     pytest.importorskip("rerun", reason="no rerun: pip install 'lerobot_env_roborecover[viz]'")
     scenario = load_scenarios(dataset)[1]

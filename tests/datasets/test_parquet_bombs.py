@@ -86,11 +86,13 @@ def is_refused_small(call, path, *words):
 # --- scenarios
 
 
+@pytest.mark.slow
 def test_millions_of_empty_fixtures_are_refused_small(root):
     put(root, "fixtures", lists([0, 4_000_000, 0, 0], empty_poses(4_000_000)))
     is_refused_small(f"read_scenarios({str(root)!r})", parquet_of(root), "field fixtures", "the limit is")
 
 
+@pytest.mark.slow
 def test_a_provenance_of_millions_of_objects_is_refused_small(root):
     text = '{"a": [' + "{}," * 20_000_000 + "{}]}"
     put(root, "provenance", pa.array(["{}", text, "{}", "{}"]))
@@ -257,6 +259,7 @@ def test_what_is_no_whole_parquet_is_one_line(tmp_path):
         read_table(tmp_path)
 
 
+@pytest.mark.slow
 def test_json_of_millions_of_lists_is_refused_small(tmp_path):
     path = tmp_path / "meta" / "file.json"
     path.parent.mkdir()
@@ -343,6 +346,7 @@ def test_honest_files_of_every_kind_read_as_they_were_written(
         assert array.tolist() == table[name].to_pylist()
 
 
+@pytest.mark.slow
 def test_honest_files_that_compress_well_are_read(tmp_path):
     rng = np.random.default_rng(0)
     path = tmp_path / "file.parquet"

@@ -162,6 +162,7 @@ def test_a_commit_of_another_client_in_between_is_not_overwritten(hub, client, l
     assert "roborecover-2.0" not in hub.repos[REPO].refs
 
 
+@pytest.mark.slow
 def test_a_dataset_that_is_not_valid_is_not_published(hub, client, local):
     path = local / "meta/roborecover/scenarios.parquet"
     path.write_bytes(path.read_bytes()[:-8] + b"00000000")

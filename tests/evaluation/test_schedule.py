@@ -52,6 +52,7 @@ def schedule(
     return world, host
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("slots", "fixed_s", "each_s", "shortest"),
     [(16, 0.1, 0.0, 100), (16, 0.02, 0.01, 100), (16, 0.05, 0.0, 20), (24, 0.1, 0.0, 20)],

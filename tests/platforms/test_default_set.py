@@ -11,6 +11,7 @@ from lerobot_roborecover.platforms import all_platforms, platform_named
 WITH_SPLIT = [p for p in all_platforms() if p.default_split]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", WITH_SPLIT, ids=lambda p: p.name)
 def test_of_a_default_set_its_tests_alone_are_evaluated(platform):
     source, split = platform.evaluated("", None)

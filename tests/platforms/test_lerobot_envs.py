@@ -296,6 +296,7 @@ def test_a_base_that_cannot_be_used_is_refused(options, says):
         env_config("lerobot", "none", options).run_spec()
 
 
+@pytest.mark.slow
 def test_the_family_stands_for_its_first_member(capsys):
     """`roborecover_wrapped` serves several platforms; as a platform's name, it is PushT."""
     scenario = load_scenarios("pusht_starter")[0]

@@ -53,6 +53,7 @@ def define(root, **changes) -> None:
     (root / "study.json").write_text(json.dumps({**found, **changes}))
 
 
+@pytest.mark.slow
 def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
     found = list(arms(read_definition(study), tmp_path / "out"))
     labels = [a.label for a in found]
@@ -99,6 +100,7 @@ trial = st.tuples(st.sampled_from(["a/recovery", "b"]), st.text('abc," \n', min_
 outcome = st.tuples(st.sampled_from(["success", "horizon"]), st.integers(0, 500))
 
 
+@pytest.mark.slow
 @given(st.dictionaries(trial, outcome))
 def test_outcomes_survive_their_file(tmp_path_factory, outcomes):
     path = tmp_path_factory.mktemp("outcomes") / "outcomes.csv"
@@ -106,6 +108,7 @@ def test_outcomes_survive_their_file(tmp_path_factory, outcomes):
     assert read_outcomes(path) == outcomes
 
 
+@pytest.mark.slow
 @given(st.dictionaries(trial, outcome), st.dictionaries(trial, outcome))
 def test_each_trial_of_today_is_counted_once(stored, today):
     found = compare(stored, today)
@@ -113,6 +116,7 @@ def test_each_trial_of_today_is_counted_once(stored, today):
     assert all(stored[key] == a and today[key] == b and a != b for key, a, b in found.different)
 
 
+@pytest.mark.slow
 def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, monkeypatch):
     stored = {("act", "s", i): (o, n) for i, (o, n) in enumerate([("success", 20), ("horizon", 45)] * 2)}
     today = {**stored, ("act", "s", 0): ("success", 22), ("act", "s", 2): ("success", 17)}
@@ -133,6 +137,7 @@ def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, m
     assert (len(other.different), len(other.close)) == (1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -157,6 +162,7 @@ def test_a_definition_that_cannot_be_used(study, changes, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_refusals(study, tmp_path, capsys):
     def refused(*argv: str) -> str:
         assert main(argv) == 2
@@ -197,6 +203,7 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path)
         run_arm(next(iter(arms(found, tmp_path / "out"))), found, ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
 def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
     recipe = read_recipe(name)
@@ -228,6 +235,7 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
     assert words.count("--trials-from") == len(paths)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
 def test_a_set_that_ships_need_not_be_built_again(tmp_path, name):
     """Its screening trials do not ship: the panel is tried once more, and is all that is read afterwards."""
@@ -251,12 +259,14 @@ def test_a_set_that_ships_need_not_be_built_again(tmp_path, name):
     assert not any(str(tmp_path / "scenarios") in word for word in everything)
 
 
+@pytest.mark.slow
 def test_a_set_that_does_not_ship_has_to_be_built(tmp_path):
     recipe = replace(read_recipe("libero"), dataset="nowhere")
     with pytest.raises(ScenarioError, match="'nowhere' of this study does not come with the package"):
         stages(tmp_path, recipe, chain_for(tmp_path, recipe), shipped=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -278,6 +288,7 @@ def test_a_recipe_that_makes_no_sense_is_refused(tmp_path, monkeypatch, text, sa
         read_recipe("other")
 
 
+@pytest.mark.slow
 def test_a_study_that_does_not_ship_is_named(capsys):
     assert main(["--name", "robotwin"]) == 2
     said = capsys.readouterr().err
@@ -285,6 +296,7 @@ def test_a_study_that_does_not_ship_is_named(capsys):
     assert "metaworld" in said
 
 
+@pytest.mark.slow
 def test_the_old_name_works_in_a_clone_and_says_where_one_is_needed(tmp_path, monkeypatch, capsys):
     assert roborecover(["study", "--stride", "0"]) == 2
     note, refused = capsys.readouterr().err.splitlines()
@@ -299,6 +311,7 @@ def test_the_old_name_works_in_a_clone_and_says_where_one_is_needed(tmp_path, mo
     )
 
 
+@pytest.mark.slow
 def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(study, tmp_path, monkeypatch):
     checkout = tmp_path / "checkout"
     shutil.copytree(study / "policies", checkout / "policies" / "fake")
@@ -317,6 +330,7 @@ def test_a_study_of_the_checkout_uses_its_policies_and_a_set_of_the_package(stud
         shipped_study("mine")
 
 
+@pytest.mark.slow
 @pytest.mark.lerobot
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_what_is_made_is_put_together_as_a_study(parts, tmp_path, elsewhere):
@@ -350,6 +364,7 @@ def test_what_is_made_is_put_together_as_a_study(parts, tmp_path, elsewhere):
     assert read_definition(study.root) == study
 
 
+@pytest.mark.slow
 def test_a_study_names_a_set_of_the_package_where_its_scenarios_are_the_same(tmp_path):
     shipped = load_scenarios("metaworld_starter")
     same, other = tmp_path / "same", tmp_path / "other"
@@ -364,6 +379,7 @@ def test_a_study_names_a_set_of_the_package_where_its_scenarios_are_the_same(tmp
     assert not comes_with_the_package(same, "")
 
 
+@pytest.mark.slow
 def test_the_stages_of_making_one_come_in_the_order_of_their_needs(tmp_path):
     recipe = read_recipe("metaworld")
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))

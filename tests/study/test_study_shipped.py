@@ -20,6 +20,7 @@ SLICES = (
 """Two of each study's test scenarios: policies from both starts, and all interventions."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_trial_of_the_shipped_study_is_stored(name):
     study = read_definition(shipped_study(name))

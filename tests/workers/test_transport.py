@@ -114,6 +114,7 @@ def test_a_worker_gives_the_same_observations_either_way(memory, monkeypatch):
     assert b"pixels" in found[0][0]
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_replaced_gets_memory_of_its_own():
     slot = slots.WorkerSlot(SlotConfig("fake", {"obs_type": "pixels_agent_pos"}), 120.0)
     spec = EpisodeSpec(fake_scenario(0), "recovery", 0, True)
