@@ -86,6 +86,7 @@ def test_every_policy_s_row_is_that_of_the_stored_outcomes(results):
                 assert all(text in row for text in macros[p] for row in own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("results", ["metaworld_recovery", "libero"], indirect=True)
 def test_every_intervention_s_row_has_its_gain_here_and_over_tasks(results):
     name, found = results
@@ -97,6 +98,7 @@ def test_every_intervention_s_row_has_its_gain_here_and_over_tasks(results):
         assert f"{over.p_holm:.2g}" in row or f"{over.p_holm:.3f}" in row or f"{over.p_holm:.4f}" in row
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("results", ["metaworld_recovery"], indirect=True)
 def test_one_inversion_is_shown_on_meta_world_and_none_over_tasks(results):
     _, found = results
@@ -114,6 +116,7 @@ def test_one_inversion_is_shown_on_meta_world_and_none_over_tasks(results):
         assert row[-1] == ("yes" if pair.shown < 0 else "no")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("results", ["libero"], indirect=True)
 def test_one_disturbed_expert_carries_libero_s_gains(results):
     _, found = results
