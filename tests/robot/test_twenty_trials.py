@@ -35,15 +35,14 @@ class Person:
     def press(self, button: str) -> None:
         self.page.click(f"#buttons [data-name={button}]")
         self.page.wait_for_function(
-            "before => document.getElementById('buttons').innerHTML !== before"
-            " || document.body.dataset.screen === 'over'",
+            "before => document.body.dataset.version !== before || document.body.dataset.screen === 'over'",
             arg=self.before,
         )
 
     def act(self) -> None:
         """One screen."""
         screen = self.look()
-        self.before = self.page.inner_html("#buttons")
+        self.before = self.page.evaluate("() => document.body.dataset.version")
         self.seen.append(screen)
         if screen == "next" and len(self.given) == 2 and not self.undone:
             self.undone = True

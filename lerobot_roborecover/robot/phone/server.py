@@ -162,8 +162,10 @@ def make_app(console: Console, door: Door, hosts: frozenset[str], scheme: str = 
         inside(request)
         pair = console.pictures.get(request.path_params["camera"])
         view = request.path_params["view"]
-        if pair is None or view not in VIEWS:
-            raise Refusal(404, "there is no such picture yet")
+        if view not in VIEWS:
+            raise Refusal(404, f"there is no view {view!r:.40}")
+        if pair is None:  # of a screen that has gone since the page asked what to show
+            return Response(status_code=204)
         data = await run_in_threadpool(_jpeg, pair, view)
         return Response(data, media_type="image/jpeg")
 

@@ -67,6 +67,7 @@ function button(name, text, action) {
 
 function showScreen(state) {
   document.body.dataset.screen = state.name;
+  document.body.dataset.version = state.version;
   byId("instruction").textContent = state.details.instruction || "";
   byId("buttons").replaceChildren(
     ...state.buttons.map((name) => button(name, WORDS[name] || name, () => press(name, state.version))),
@@ -88,9 +89,11 @@ function showPictures(state) {
     if (!figure.dataset.camera) {
       figure.dataset.camera = camera;
       figure.append(new Image(), document.createElement("figcaption"));
-      figure.firstChild.alt = `Picture of camera ${camera}`;
     }
-    figure.firstChild.src = `api/ghost/${encodeURIComponent(camera)}/${placing ? view : "live"}?${Date.now()}`;
+    const fresh = new Image(); // the one before stays until this one is there
+    fresh.alt = `Picture of camera ${camera}`;
+    fresh.addEventListener("load", () => figure.firstChild.replaceWith(fresh));
+    fresh.src = `api/ghost/${encodeURIComponent(camera)}/${placing ? view : "live"}?${Date.now()}`;
     const found = errors[camera] || {};
     const said = [
       ["camera", found.background_px, "px"], ["objects", found.object_px, "px"], ["tags", found.tag_mm, "mm"],
