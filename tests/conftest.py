@@ -8,7 +8,6 @@ import logging
 import os
 import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -92,25 +91,12 @@ def no_vulkan():
 
 
 @pytest.fixture
-def run_lerobot_eval(monkeypatch, tmp_path):
+def run_lerobot_eval(tmp_path):
     """Runs `lerobot-eval` in this process, through LeRobot's own parser and loop; returns the output
     folder."""
-    from lerobot.scripts import lerobot_eval as script
+    from tests.support.stock_eval import lerobot_eval
 
-    import lerobot_roborecover.plugin as plugin
-
-    def run(*args: str, out: str = "out") -> Path:
-        folder = tmp_path / out
-        argv = ["lerobot-eval", *args, "--policy.device=cpu", f"--output_dir={folder}"]
-        monkeypatch.setattr(sys, "argv", plugin.rewrite_env_argument(argv))
-        level = logging.getLogger().level
-        try:
-            script.eval_main()
-        finally:
-            logging.getLogger().setLevel(level)
-        return folder
-
-    return run
+    return lambda *args, out="out": lerobot_eval(tmp_path / out, *args)
 
 
 HEAVY = ("slow", "nightly", "lerobot", "libero", "metaworld", "robotwin", "ray", "browser")

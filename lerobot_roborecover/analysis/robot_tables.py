@@ -6,14 +6,14 @@ import math
 from dataclasses import replace
 
 from lerobot_roborecover.analysis.results import Results
-from lerobot_roborecover.analysis.second_rater import FOLDER, LOG_FILE, agreement_of
+from lerobot_roborecover.analysis.second_rater import FOLDER, agreement_of
 from lerobot_roborecover.analysis.stats.start_error import MEASURES, summary, verdict_slope
 from lerobot_roborecover.analysis.tables import Column, Table
+from lerobot_roborecover.logs.log_file import TRIALS_FILE
 from lerobot_roborecover.scenario import Outcome
 
 _MIN_SECONDS = 60.0
 _OVERALL = ("Trials", "Successes %")
-_SHORT = {"Not run: start too far off": "Not run", "Minutes a reset": "Reset, min"}
 
 
 def robot_tables(results: Results) -> list[Table]:
@@ -40,7 +40,7 @@ def outcome_words(outcome: Outcome, robots: bool) -> str:
     on_robots = {
         Outcome.HORIZON: "failure",
         Outcome.SIM_ERROR: "equipment, or called invalid",
-        Outcome.STATE_MISMATCH: "start too far off",
+        Outcome.STATE_MISMATCH: "not run",
     }
     return (on_robots if robots else {}).get(outcome, outcome.value.replace("_", " "))
 
@@ -54,10 +54,7 @@ def starts_in_short(results: Results) -> Table:
     return replace(
         table,
         title="",
-        columns=tuple(
-            replace(table.columns[i], title=_SHORT.get(table.columns[i].title, table.columns[i].title))
-            for i in kept
-        ),
+        columns=tuple(table.columns[i] for i in kept),
         rows=tuple(tuple(row[i] for i in kept) for row in table.rows),
         notes=(),
     )
@@ -65,7 +62,7 @@ def starts_in_short(results: Results) -> Table:
 
 def second_raters(results: Results) -> Table:
     """How verdicts of second raters go with the first ones."""
-    logs = [log for log in results.study.logs if log.name == LOG_FILE]
+    logs = [log for log in results.study.logs if log.name == TRIALS_FILE]
     folders = sorted({log.parent for log in logs if (log.parent / FOLDER).is_dir()})
     rows = [
         (rater, count, share, kappa)
@@ -96,14 +93,14 @@ def starts(results: Results) -> Table:
         rows.append((title, found.trials, rate, found.not_run, *spread, found.reset_s / _MIN_SECONDS))
     columns = (
         Column("Policy"), Column("Trials", "count"), Column("Successes %", "percent"),
-        Column("Not run: start too far off", "count"),
+        Column("Not run", "count"),
         *(Column(f"{words}: {kind}", "ratio") for _, words in MEASURES for kind in ("median", "90 %")),
         Column("Minutes a reset", "number"),
     )  # fmt: skip
     notes = (
         "Start error: how far robot and scene were from the recovery point when the policy took over; the "
-        "worst joint, camera and object region of each trial, as measured. Policies whose starts differ are "
-        "not compared fairly.",
+        "worst joint, camera and object region of each trial, as measured. Not run: the start was outside "
+        "the tolerance, or a person skipped it. Policies whose starts differ are not compared fairly.",
     )
     return Table("robot_starts", "Where robots' trials started", columns, tuple(rows), notes)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_roborecover.logs.log_file import TRIALS_FILE
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.scenario import ScenarioError
@@ -14,7 +15,6 @@ from lerobot_roborecover.utils.journal import read_journal
 FOLDER = "ratings"
 """Beside the trial log: a journal a rater."""
 SCHEMA = 1
-LOG_FILE = "trials.jsonl"
 
 
 def recorded(run: Path) -> list[TrialRow]:
@@ -23,7 +23,7 @@ def recorded(run: Path) -> list[TrialRow]:
     Raises:
         ScenarioError: there are none.
     """
-    rows = read_trial_log(run / LOG_FILE)
+    rows = read_trial_log(run / TRIALS_FILE)
     found = [
         r for r in rows if r.robot is not None and r.robot["episode"] is not None
         and r.robot["verdict"] != "invalid"

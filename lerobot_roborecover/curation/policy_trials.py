@@ -19,6 +19,7 @@ from lerobot_roborecover.evaluation.session import create_session
 from lerobot_roborecover.evaluation.trial import Trial
 from lerobot_roborecover.evaluation.work_items import unfinished, units_of
 from lerobot_roborecover.logs.fields import digest_of
+from lerobot_roborecover.logs.log_file import TRIALS_FILE
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, LoggedTrial, TrialRow, put_actions, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import platform_named
@@ -30,7 +31,6 @@ from lerobot_roborecover.workers.backend import LOCAL, Backend
 if TYPE_CHECKING:
     from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
 
-TRIALS_FILE = "trials.jsonl"
 CURRENT_FILE = "current.json"
 """Which of the log's rows are those of the last run: the others are of other files, options or seeds."""
 

@@ -11,8 +11,8 @@ from typing import Any
 from lerobot_roborecover.platforms import versions
 from lerobot_roborecover.platforms.findings import Check, Status
 from lerobot_roborecover.utils.lerobot_versions import TESTED, version_problem
+from lerobot_roborecover.utils.text import DISTRIBUTION
 
-DISTRIBUTION = "lerobot_env_roborecover"
 MINIMUM_PYTHON = (3, 12)
 
 

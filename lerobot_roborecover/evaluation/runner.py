@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -38,7 +37,7 @@ from lerobot_roborecover.policies.metadata import policy_metadata
 from lerobot_roborecover.scenario import Start
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.options import move_old_fields
-from lerobot_roborecover.utils.signals import STOP_SIGNALS, exit_status, handle, put_back
+from lerobot_roborecover.utils.signals import StopCondition
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import Backend
 
@@ -169,36 +168,6 @@ class RecoveryEvalConfig(EvalPipelineConfig):
         """`output_dir`."""
         assert self.output_dir is not None, "LeRobot sets it where the user does not"
         return Path(self.output_dir)
-
-
-class StopCondition:
-    """Says when to stop: after a time limit, or at the first Ctrl-C, SIGTERM or SIGHUP. A second one of the
-    same kind ends the process at once.
-
-    Args:
-        limit_s: seconds from now; 0 for none.
-    """
-
-    def __init__(self, limit_s: float):
-        self._deadline = time.monotonic() + limit_s if limit_s else float("inf")
-        self.reason = ""
-        self.status = 0
-        """Exit status of a run that stopped before its end."""
-        self._before = handle(STOP_SIGNALS, self._interrupt)
-
-    def _interrupt(self, number: int, _frame: object) -> None:
-        self.reason, self.status = "interrupted", exit_status(number)
-        put_back({number: self._before.pop(number)})
-
-    def __call__(self) -> bool:
-        """Whether to stop; `reason` then says why."""
-        if not self.reason and time.monotonic() >= self._deadline:
-            self.reason = "time limit reached"
-        return bool(self.reason)
-
-    def restore(self) -> None:
-        """Puts the caller's own signal handlers back."""
-        put_back(self._before)
 
 
 def evaluate(cfg: RecoveryEvalConfig) -> int:

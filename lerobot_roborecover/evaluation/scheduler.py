@@ -225,11 +225,9 @@ class Engine:
 
     def _events(self) -> list[Event]:
         """What can happen next."""
-        events: list[Event] = []
-        events += [(r, lambda r=r: self._answered(r)) for r in self._asked]
-        events += [
-            (s.slot, lambda s=s: self._replied(s)) for s in self._active_trials() if s.trial.in_simulator
-        ]
+        events: list[Event] = [(r, lambda r=r: self._answered(r)) for r in self._asked]
+        working = [s for s in self._active_trials() if s.trial.in_simulator]
+        events += [(s.slot, lambda s=s: self._replied(s)) for s in working]
         if len(self._queue):
             parties = [*self._replicas, *self._slots]
             events += [(p, p.poll_startup) for p in parties if p.starting]
@@ -248,27 +246,20 @@ class Engine:
         """
         inline = [e for e in events if e[0].ready is True]
         others = [e for e in events if e[0].ready is not True]
-        arrived = []
-        if others:
-            arrived = self._arrived(others, 0.0 if inline else timeout_s)
+        arrived = self._arrived(others, 0.0 if inline else timeout_s) if others else []
         for _, act in arrived or inline:  # an inference in this process blocks all slots: replies come first
             act()
         return bool(arrived or inline)
 
     def _arrived(self, events: list[Event], timeout_s: float) -> list[Event]:
-        now = self._clock()
-        deadline = min(getattr(party, "deadline", float("inf")) for party, _ in events)
-        timeout_s = min(timeout_s, deadline - now)
+        now, deadlines = self._clock(), [getattr(party, "deadline", float("inf")) for party, _ in events]
+        timeout_s = min(timeout_s, min(deadlines) - now)
         for replica in self._replicas:
             if (at := self._ask_at(replica)) is not None:
                 timeout_s = min(timeout_s, at - now)
         ready = set(map(id, self._wait([p.ready for p, _ in events], max(timeout_s, 0.0))))
         now = self._clock()
-        return [
-            (party, act)
-            for party, act in events
-            if id(party.ready) in ready or getattr(party, "deadline", float("inf")) <= now
-        ]
+        return [e for e, at in zip(events, deadlines, strict=True) if id(e[0].ready) in ready or at <= now]
 
     def _answered(self, replica: Replica) -> None:
         asked, began = self._asked.pop(replica)
@@ -398,8 +389,8 @@ class Engine:
         if self._first is not None and self._first.hold(trial, replica):
             return
         self._write_first()
-        host = replica.host
-        noise = host.noise(self._run.protocol.run_seed)
-        row = self._run.record(trial, noise=noise, batch_size=host.max_batch if host.batched else 1)
+        host, seed = replica.host, self._run.protocol.run_seed
+        batch_size = host.max_batch if host.batched else 1
+        row = self._run.record(trial, noise=host.noise(seed), batch_size=batch_size)
         self._finished += 1
         self._on_row(row)

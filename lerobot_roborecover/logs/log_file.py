@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 LOG_SUFFIXES = (".jsonl", ".jsonl.gz", ".jsonl.zst")
+TRIALS_FILE = "trials.jsonl"
+"""What a run calls its log, where the user names none."""
 """Names of trial logs in a folder."""
 _GZIP, _ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
 _HEAD_BYTES = 2**16

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,7 +17,6 @@ from unicodedata import normalize
 
 import numpy as np
 
-from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.logs.fields import MAX_TEXT, TRIAL_SCHEMA
 from lerobot_roborecover.platforms import resolve_rewind_steps
 from lerobot_roborecover.replay.handoff import Handoff
@@ -316,8 +314,8 @@ def put_actions(folder: Path, actions: np.ndarray, row: TrialRow) -> None:
         row: the trial's.
     """
     path = actions_path(folder, row)
-    if row.steps and not path.exists():  # trials may have the same actions, and another process may put them
-        with suppress(InUseError), atomic_file(path) as file, open(file, "wb") as stream:
+    if row.steps and not path.exists():  # trials may have the same actions
+        with atomic_file(path) as file, open(file, "wb") as stream:
             np.save(stream, actions, allow_pickle=False)
 
 

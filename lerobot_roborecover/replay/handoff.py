@@ -20,7 +20,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.platforms.robot_fingerprint import NAME, compare_robots, is_robot_entry
 from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError, advance
 from lerobot_roborecover.scenario import (
@@ -82,9 +81,8 @@ class SnapshotCache:
         self._remember(key, (snapshot, state_sha256))
         if self._folder is not None:
             body = state_sha256.encode() + snapshot
-            # A full disk costs a replay later, and another worker may be keeping the same one: neither is to
-            # cost the trial.
-            with suppress(OSError, InUseError):
+            # A full disk costs a replay later; it is not to cost the trial.
+            with suppress(OSError):
                 atomic_write(self._folder / f"{key}.snapshot", hashlib.sha256(body).digest() + body)
 
     def reject(self, key: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -100,6 +100,10 @@ class Console:
                     self._lock.wait(0.2)
                 if self._answers:
                     return self._answers.popleft()
+
+    def show_live(self, pictures: Mapping[str, np.ndarray]) -> None:
+        """Shows pictures by camera that have no recorded ones beside them."""
+        self.pictures = {camera: (picture, picture) for camera, picture in pictures.items()}
 
     def update(self, **details: Any) -> None:
         """Renews values of the present screen."""

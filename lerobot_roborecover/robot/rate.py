@@ -131,7 +131,7 @@ class Recording:
         due = int((time.monotonic() - self._begun) / _FRAME_S) % (self._count + _END_FRAMES)
         shown = min(due, self._count - 1)
         self._console.update(moment=shown + 1, moments=self._count)
-        self._console.pictures = {c: (p[shown], p[shown]) for c, p in self._pictures.items()}
+        self._console.show_live({c: p[shown] for c, p in self._pictures.items()})
 
 
 def agreement_text(run: Path) -> str:

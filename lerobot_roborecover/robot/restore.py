@@ -37,9 +37,9 @@ class LivePictures:
             with asking(self._robot):
                 observation = self._robot.get_observation()
         except RobotError:
-            self._console.pictures = {}
+            self._console.show_live({})
         else:
-            self._console.pictures = {c: (observation[c],) * 2 for c in camera_names(self._robot)}
+            self._console.show_live({c: observation[c] for c in camera_names(self._robot)})
         self._last = time.monotonic()
 
 
@@ -48,7 +48,7 @@ def _words(tolerance: Tolerance) -> str:
     limits = (("objects", tolerance.object_px, "px"), ("camera", tolerance.background_px, "px"),
               ("tags", tolerance.tag_mm if tolerance.tag_side_mm else 0.0, "mm"))  # fmt: skip
     said = ", ".join(f"{what} {limit:g} {unit}" for what, limit, unit in limits if limit)
-    return f" At most off by: {said}." if said else ""
+    return f" At most off by, but for cameras on the arm: {said}." if said else ""
 
 
 @dataclass(frozen=True)

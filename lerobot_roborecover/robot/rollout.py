@@ -135,7 +135,7 @@ class RecordedRollout:
                 return
             observation = robot.get_observation()
             self._recorder.observed()
-            self._console.pictures = {c: (observation[c],) * 2 for c in camera_names(robot)}
+            self._console.show_live({c: observation[c] for c in camera_names(robot)})
             if problem := self._frozen(robot, observation, tick):
                 self.end.ended, self.end.problem = "trouble", problem
                 return

@@ -6,27 +6,30 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from lerobot_roborecover.errors import OptionError
-from lerobot_roborecover.logs.robot import RobotTrial, StartError
-from lerobot_roborecover.logs.row import EvalProtocol, RunExtent, TrialRow, make_row
-from lerobot_roborecover.robot.connection import RobotError, calibration_sha256, check_point
+from lerobot_roborecover.logs.robot import StartError
+from lerobot_roborecover.robot.connection import RobotError, check_point
 from lerobot_roborecover.robot.console import Answer, Console
-from lerobot_roborecover.robot.plan import LockedPlan, PlannedPolicy, PlannedTrial
+from lerobot_roborecover.robot.plan import LockedPlan, PlannedTrial
 from lerobot_roborecover.robot.points import PointSet, RobotPoint
 from lerobot_roborecover.robot.recorder import Recorder
 from lerobot_roborecover.robot.restore import LivePictures, restore
 from lerobot_roborecover.robot.run_journal import RunJournal, dataset_folder
 from lerobot_roborecover.robot.trial_columns import COLUMNS, trial_values
-from lerobot_roborecover.scenario import Outcome, Start
+from lerobot_roborecover.robot.trial_rows import TrialRows
+from lerobot_roborecover.scenario import Outcome
 from lerobot_roborecover.utils.text import pluralize
 
 MIN_FREE_BYTES = 2**28
 """Room that has to be on the disk before a trial: its video may take that much."""
 MAX_CLOCK_JUMP_S = 2.0
+_ENDED = {
+    "time": "Time is up. ",
+    "stop": "You stopped it: a failure if the policy was at fault, else invalid. ",
+}
 REASONS = ("robot", "camera", "person", "scene", "other")
 """Why a person calls a trial invalid."""
 
@@ -79,6 +82,7 @@ class RobotRun:
         self.robot, self.plan, self.points, self.journal = robot, plan, points, journal
         self.console, self.config, self.teleop, self.say = console, config, teleop, say
         self._by_id = {p.id: p for p in points.points}
+        self._rows = TrialRows(robot, plan, points, config.rater, getattr(config.inference, "type", "sync"))
         self._contexts: dict[str, Any] = {}
         self._recorder: Recorder | None = None
 
@@ -137,11 +141,11 @@ class RobotRun:
             self._trial(left[0])
             done += 1
         total = len(self.journal.rows())
-        text = (
-            f"{pluralize(total, 'trial')} of {len(self.plan.trials)} done. The terminal says what comes next."
-        )
-        self.console.show("over", text)
-        self.say(f"{pluralize(total, 'trial')} of {len(self.plan.trials)} in {self.journal.log}")
+        done_of = f"{pluralize(total, 'trial')} of {len(self.plan.trials)}"
+        over = total == len(self.plan.trials)
+        after = "The terminal says what comes next" if over else "The same command goes on with the others"
+        self.console.show("over", f"{done_of} done. {after}.")
+        self.say(f"{done_of} in {self.journal.log}{'' if over else '; the same command goes on'}")
         return total
 
     def _title(self, trial: PlannedTrial) -> str:
@@ -153,7 +157,8 @@ class RobotRun:
         if not finished:
             return ""
         order, row = list(finished.items())[-1]
-        said = "not run" if row["outcome"] == Outcome.STATE_MISMATCH else row["robot"]["verdict"]
+        not_run = row["outcome"] == Outcome.STATE_MISMATCH
+        said = f"not run, {row['reason']}" if not_run else row["robot"]["verdict"]
         return f" Trial {order + 1}: {said}."
 
     def _say_raters(self) -> None:
@@ -220,7 +225,7 @@ class RobotRun:
         }
         self.journal.note("restored", **values, reason=restored.reason)
         if restored.reason:
-            row = self._row(trial, values, Outcome.STATE_MISMATCH, restored.reason, "invalid")
+            row = self._rows.make(trial, values, Outcome.STATE_MISMATCH, restored.reason, "invalid")
             self.journal.finish(trial.order, row)
             self.say(f"trial {trial.order + 1}: not run: {restored.reason}")
             return
@@ -241,7 +246,7 @@ class RobotRun:
         buttons = ("success", "failure", "end", *(("takeover", "handback") if self.teleop else ()))
         self.console.show(
             "running",
-            f"{self._title(trial)}: the policy runs. Keep your hands away.",
+            f"{self._title(trial)}: the policy runs. Hands away; press Success once the task is done.",
             buttons,
             {"instruction": point.scenario.task.instruction, "limit_s": point.time_limit_s},
         )
@@ -280,7 +285,7 @@ class RobotRun:
         """
         if record["ended"] in ("trouble", "policy"):
             outcome = Outcome.POLICY_ERROR if record["ended"] == "policy" else Outcome.SIM_ERROR
-            row = self._row(trial, record, outcome, record["problem"], "invalid")
+            row = self._rows.make(trial, record, outcome, record["problem"], "invalid")
             self.journal.finish(trial.order, row)
             self.say(f"trial {trial.order + 1}: {record['problem']}")
             return
@@ -291,10 +296,10 @@ class RobotRun:
         if said.button == "invalid":
             reason = said.values.get("reason", "other")
             text = f"invalid ({reason if reason in REASONS else 'other'}){': ' + note if note else ''}"
-            row = self._row(trial, record, Outcome.SIM_ERROR, text, "invalid", note)
+            row = self._rows.make(trial, record, Outcome.SIM_ERROR, text, "invalid", note)
         else:
             outcome = Outcome.SUCCESS if said.button == "success" else Outcome.HORIZON
-            row = self._row(trial, record, outcome, "", said.button, note)
+            row = self._rows.make(trial, record, outcome, "", said.button, note)
         self.journal.finish(trial.order, row)
         self.say(f"trial {trial.order + 1}: {said.button}")
 
@@ -302,7 +307,7 @@ class RobotRun:
         from lerobot_roborecover.robot.episodes import Episodes
         from lerobot_roborecover.robot.rate import Recording
 
-        ended = {"time": "Time is up. ", "stop": "You stopped it. "}.get(record["ended"], "")
+        ended = _ENDED.get(record["ended"], "")
         text = f"{ended}{self._title(trial)}: is the task done?"
         pictures: Callable[[], None] = LivePictures(self.robot, self.console)
         if again and record["episode"] is not None:
@@ -318,72 +323,6 @@ class RobotRun:
                 "reasons": list(REASONS),
             },
             pictures,
-        )
-
-    def _row(
-        self,
-        trial: PlannedTrial,
-        record: Mapping[str, Any],
-        outcome: Outcome,
-        reason: str,
-        verdict: Any,
-        note: str = "",
-    ) -> TrialRow:
-        point, planned = self._by_id[trial.point], self.plan.plan.policies[trial.policy]
-        start = record.get("start_error")
-        robot = RobotTrial(
-            robot_type=point.robot_type,
-            calibration_sha256=calibration_sha256(self.robot),
-            verdict=verdict,
-            rater=self.config.rater,
-            code=trial.code,
-            start_error=None if start is None else StartError.of_json(start),
-            reset_s=record.get("reset_s"),
-            attempts=record.get("attempts", 0),
-            duration_s=record.get("duration_s", 0.0),
-            block=trial.block,
-            order=trial.order,
-            episode=record.get("episode"),
-            note=note,
-            clock_jump_s=record.get("clock_jump_s", 0.0),
-        )
-        return make_row(
-            point.scenario,
-            self._protocol(trial.policy, planned),
-            dataset=str(self.points.root),
-            dataset_revision=None,
-            trial=trial.trial,
-            noise="unseeded",
-            batch_size=1,
-            outcome=outcome,
-            reason=reason,
-            steps=record.get("steps", 0),
-            handoff=None,
-            sim_s=record.get("reset_s") or 0.0,
-            policy_s=record.get("duration_s", 0.0),
-            actions_sha256=record.get("actions_sha256", ""),
-            interventions=record.get("interventions", ()),
-            extent=RunExtent(len(self._by_id), self.plan.plan.repeats),
-            robot=robot.as_json(),
-        )
-
-    def _protocol(self, name: str, planned: PlannedPolicy) -> EvalProtocol:
-        settings: dict[str, Any] = {
-            "overrides": list(planned.overrides),
-            "rename_map": dict(planned.rename_map),
-        }
-        if list(self.plan.identities.values()).count(self.plan.identities[name]) > 1:
-            settings["name"] = name  # an A/A comparison: one policy under two names
-        inference = getattr(self.config.inference, "type", "sync")
-        return EvalProtocol(
-            start=Start.RECOVERY.value,
-            rewind_steps=0,
-            policy=self.plan.identities[name],
-            run_seed=self.plan.plan.seed,
-            execution_horizon=None,
-            policy_settings=settings,
-            options={"plan_sha256": self.plan.sha256, "policy_name": name, "inference": inference},
-            versions={"lerobot": version("lerobot")},
         )
 
     def _context(self, name: str) -> Any:
@@ -408,6 +347,3 @@ class RobotRun:
             root, features = dataset_folder(self.config.folder), context.data.dataset_features
             self._recorder = Recorder(root, root.name, self.robot, features, fps, COLUMNS)
         return self._recorder
-
-
-__all__ = ["RobotRun", "RunConfig"]

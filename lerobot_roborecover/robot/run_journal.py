@@ -12,12 +12,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from lerobot_roborecover.logs.log_file import TRIALS_FILE
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.robot.trial_columns import verdicts_of, write_columns
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.journal import Journal
 
-JOURNAL_FILE, LOG_FILE = "journal.jsonl", "trials.jsonl"
+JOURNAL_FILE = "journal.jsonl"
 SCHEMA = 1
 
 
@@ -38,7 +39,7 @@ class RunJournal:
 
     def __init__(self, folder: Path):
         self._journal = Journal(folder / JOURNAL_FILE, SCHEMA)
-        self.log, self._dataset = folder / LOG_FILE, dataset_folder(folder)
+        self.log, self._dataset = folder / TRIALS_FILE, dataset_folder(folder)
         self.put_right()
 
     def note(self, kind: str, **values: Any) -> None:

@@ -70,8 +70,10 @@ def check_unlocked(path: Path) -> None:
 def _lock_existing(path: Path) -> Generator[None]:
     """Holds a file's lock, so that no process begins to write a file that is about to be replaced.
 
+    The lock is shared: who replaces the same file at the same moment is not in the way, the last one wins.
+
     Raises:
-        InUseError: another process has locked the file.
+        InUseError: another process has the file for itself, such as a log that it writes.
     """
     with ExitStack() as stack:
         # Neither a device nor a FIFO is opened: that can block.
@@ -80,7 +82,7 @@ def _lock_existing(path: Path) -> Generator[None]:
                 file = stack.enter_context(open(path, "rb"))
             except OSError:
                 break  # not readable: no run of this user has it open
-            if lock_file(file, fcntl.LOCK_EX | fcntl.LOCK_NB) is LockResult.IN_USE:
+            if lock_file(file, fcntl.LOCK_SH | fcntl.LOCK_NB) is LockResult.IN_USE:
                 raise InUseError(
                     f"{path} is in use by another process and is not replaced. Wait for that process, or "
                     "name another file"

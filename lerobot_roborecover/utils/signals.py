@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from types import FrameType
@@ -80,3 +81,33 @@ def _main_thread() -> bool:
 
 def _is_default(number: int) -> bool:
     return signal.getsignal(number) is signal.SIG_DFL
+
+
+class StopCondition:
+    """Says when to stop: after a time limit, or at the first Ctrl-C, SIGTERM or SIGHUP. A second one of the
+    same kind ends the process at once.
+
+    Args:
+        limit_s: seconds from now; 0 for none.
+    """
+
+    def __init__(self, limit_s: float):
+        self._deadline = time.monotonic() + limit_s if limit_s else float("inf")
+        self.reason = ""
+        self.status = 0
+        """Exit status of a run that stopped before its end."""
+        self._before = handle(STOP_SIGNALS, self._interrupt)
+
+    def _interrupt(self, number: int, _frame: object) -> None:
+        self.reason, self.status = "interrupted", exit_status(number)
+        put_back({number: self._before.pop(number)})
+
+    def __call__(self) -> bool:
+        """Whether to stop; `reason` then says why."""
+        if not self.reason and time.monotonic() >= self._deadline:
+            self.reason = "time limit reached"
+        return bool(self.reason)
+
+    def restore(self) -> None:
+        """Puts the caller's own signal handlers back."""
+        put_back(self._before)

@@ -41,6 +41,10 @@ command."""
 class Slot(Protocol):
     """Runs one trial at a time."""
 
+    @property
+    def starting(self) -> bool:
+        """Whether it cannot be asked yet; `ready` then says when to call `poll_startup`."""
+
     def send(self, command: str, argument: object = None) -> None:
         """Starts a command."""
 
@@ -54,10 +58,6 @@ class Slot(Protocol):
 
 class SimulatorWorker(Slot, Protocol):
     """A slot in a process of its own, so that its caller need not wait: here, or on a cluster."""
-
-    @property
-    def starting(self) -> bool:
-        """Whether it cannot be asked yet; `ready` then says when to call `poll_startup`."""
 
     @property
     def ready(self) -> Any:
@@ -83,6 +83,8 @@ type MakeSlot = Callable[[SlotConfig, float, int], Slot]
 
 class InlineSlot:
     """Runs the simulator in this process: for debugging; nothing guards against one that hangs."""
+
+    starting = False
 
     def __init__(self, config: SlotConfig):
         self._config = config
@@ -333,9 +335,9 @@ class SlotPool:
         return sorted(made, key=lambda slot: slot.starting)[:count]
 
     def ask(self, command: str) -> Reply:
-        """The first slot's reply to a command that has no argument."""
+        """A slot's reply to a command that has no argument."""
         self.slots(1)
-        slot = min(self._slots, key=lambda each: getattr(each, "starting", False))
+        slot = min(self._slots, key=lambda each: each.starting)
         for _ in range(MAX_ATTEMPTS):
             slot.send(command)
             reply = slot.receive()

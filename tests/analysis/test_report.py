@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +11,6 @@ import pytest
 
 from lerobot_roborecover.analysis.analyse import analyse
 from lerobot_roborecover.analysis.logs import read_study
-from lerobot_roborecover.analysis.make import report
 from lerobot_roborecover.analysis.options import Options
 from lerobot_roborecover.analysis.pages.gallery import make_cards
 from lerobot_roborecover.analysis.pages.report import headline, write_report
@@ -391,24 +387,3 @@ def test_command_on_logs_of_the_real_runner(tmp_path, capsys):
     assert "3 scenario(s) that" in capsys.readouterr().err
     assert main(["report", str(runs), f"--out={out}", "--draws=5"]) == 2
     assert "take at least 100" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_reading_logs_needs_no_simulator_and_no_lerobot(tmp_path):
-    path = log(tmp_path, policy_rows("a", 4, 2, 0.5, 0))
-    code = (
-        "import sys; from lerobot_roborecover.cli.main import main; "
-        f"status = main(['report', {path!r}, '--out', {str(tmp_path / 'out')!r}, '--draws', '100']); "
-        "print(sorted({'torch', 'lerobot', 'mujoco'} & set(sys.modules))); sys.exit(status)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
-@pytest.mark.slow
-def test_a_report_leaves_the_garbage_collector_as_it_was(tmp_path):
-    """It is called from training loops, too: what is garbage then must not stay for ever."""
-    log = write_log(tmp_path / "log.jsonl", policy_rows("p", 8, 1, 0.5, 0))
-    before = gc.get_freeze_count()
-    report(log, tmp_path / "out", options=Options(draws=100))
-    assert gc.get_freeze_count() == before

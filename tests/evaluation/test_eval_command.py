@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import av
@@ -23,6 +24,7 @@ from lerobot_roborecover.logs.trial_log import read_trial_log
 from tests.support.factories import fake_dataset, fake_scenario, save_policy
 from tests.support.loop import outcomes
 from tests.support.processes import PATIENCE_S, alive_after, children
+from tests.support.stock_eval import lerobot_eval
 
 pytestmark = pytest.mark.lerobot
 
@@ -67,19 +69,11 @@ def whole(dataset, policy, tmp_path_factory):
 
 
 def stock(dataset, policy, out, *extra):
-    from lerobot.scripts import lerobot_eval as script
-
-    import lerobot_roborecover.plugin as plugin
-
-    argv = [
-        "lerobot-eval", "--env", "roborecover_fake", f"--env.scenarios={dataset}", f"--policy.path={policy}",
-        "--policy.device=cpu", f"--eval.n_episodes={TRIALS}", "--eval.batch_size=1",
-        "--eval.use_async_envs=false", f"--output_dir={out}", *extra,
-    ]  # fmt: skip
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", plugin.rewrite_env_argument(argv))
-        script.eval_main()
-    return outcomes(read_trial_log(out / "trials.jsonl"))
+    lerobot_eval(
+        out, "--env", "roborecover_fake", f"--env.scenarios={dataset}", f"--policy.path={policy}",
+        f"--eval.n_episodes={TRIALS}", "--eval.batch_size=1", "--eval.use_async_envs=false", *extra,
+    )  # fmt: skip
+    return outcomes(rows_of(out))
 
 
 def rows_of(out: Path):
@@ -184,9 +178,9 @@ def temporary(tmp_path, monkeypatch):
     ("number", "status"), [(signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly)]
 )
 def test_stop_signals_leave_a_log_that_a_rerun_completes(
-    run, whole, monkeypatch, capsys, temporary, number, status
+    run, whole, monkeypatch, capsys, temporary, request, number, status
 ):
-    """A scheduler's, and a closed terminal's; Ctrl-C's is below."""
+    """A scheduler's, and a closed terminal's, which nohup would have ignored; Ctrl-C's is below."""
     show, shown = ProgressLine.show, []
 
     def shows(self, *arguments, **options):
@@ -196,9 +190,8 @@ def test_stop_signals_leave_a_log_that_a_rerun_completes(
             signal.raise_signal(number)
 
     monkeypatch.setattr(ProgressLine, "show", shows)
-    before = signal.signal(number, signal.SIG_DFL)  # under nohup a hang-up is ignored, here, too
+    request.addfinalizer(partial(signal.signal, number, signal.signal(number, signal.SIG_DFL)))
     out = run(status=status)
-    signal.signal(number, before)
     assert len(rows_of(out)) == 2
     assert "interrupted: 2 of 12 trials done; to go on, run the same command" in capsys.readouterr().err
     assert (out / "eval_info.json").exists()
@@ -208,8 +201,7 @@ def test_stop_signals_leave_a_log_that_a_rerun_completes(
 
 
 def test_a_full_disk_is_one_line_and_keeps_finished_trials(run, whole, tmp_path, monkeypatch, capsys):
-    log = tmp_path / "out" / "trials.jsonl"
-    write = os.write
+    log, write = tmp_path / "out" / "trials.jsonl", os.write
 
     def full(number: int, data: bytes) -> int:
         """Half of the fifth row fits."""
@@ -263,8 +255,7 @@ def test_ctrl_c_or_a_kill_leaves_a_log_that_a_rerun_completes(
         assert "interrupted" in errors
     assert len(simulators) == 2
     assert not alive_after(simulators)
-    left = list(temporary.glob("roborecover-snapshots-*"))
-    assert len(left) == (how is signal.SIGKILL)
+    assert len(list(temporary.glob("roborecover-snapshots-*"))) == (how is signal.SIGKILL)
     finished = log.read_bytes()
     finished = finished[: finished.rfind(b"\n") + 1]
     assert 2 <= finished.count(b"\n") < COUNT * TRIALS

@@ -8,13 +8,12 @@ import pytest
 
 from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.logs.trial_log import read_trial_log
-from tests.robot.test_run import made, plan_of  # noqa: F401 - a fixture
 
 pytest.importorskip("fieldtrial", reason="fieldtrial is not installed")
 pytestmark = [pytest.mark.lerobot, pytest.mark.slow, pytest.mark.nightly]
 
 
-def test_fieldtrial_runs_a_plan_of_ours(made, tmp_path, capsys):  # noqa: F811
+def test_fieldtrial_runs_a_plan_of_ours(made, tmp_path, capsys):
     import yaml
     from fieldtrial.runners.base import ArmSpec, TrialContext
     from fieldtrial.runners.command import CommandRunner

@@ -4,54 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 
 import pytest
 
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.robot import RobotTrial
 from lerobot_roborecover.logs.trial_log import read_trial_log
-from lerobot_roborecover.robot.connection import RobotError
 from lerobot_roborecover.robot.console import Answer, Console
 from lerobot_roborecover.robot.plan import lock_plan, parse_plan
-from lerobot_roborecover.robot.recorder import marks
 from lerobot_roborecover.robot.run_journal import RunJournal, dataset_folder
 from lerobot_roborecover.robot.trial_columns import COLUMNS, write_columns
 from lerobot_roborecover.scenario import ScenarioError
-from tests.support.robot_lab import lab, scripted
+from tests.support.robot_lab import lab
 
 pytestmark = pytest.mark.lerobot
-FPS = 20
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Policies, and two recovery points of episodes that were captured on the lab."""
-    from lerobot_roborecover.robot.capture import capture
-    from lerobot_roborecover.robot.episodes import Episodes, PointRequest
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
-    from lerobot_roborecover.robot.points import write_points
-    from lerobot_roborecover.robot.policies import load_context
-
-    root = tmp_path_factory.mktemp("robot")
-    scripted(root / "good", size=48)
-    scripted(root / "worse", size=48, bias_mm=200.0)
-    with lab(root) as robot:
-        context = load_context(robot, str(root / "worse"), fps=FPS, instruction=robot.instruction)
-        found = capture(
-            robot, context, root / "cube", Console(SimulatedOperator(robot)), episodes=2, limit_s=5.0,
-            instruction=robot.instruction, say=lambda line: None,
-        )  # fmt: skip
-    assert found == 2
-    episodes = Episodes(root / "cube")
-    both = [
-        episodes.point(
-            PointRequest(m["episode"], m["frame"], "Approach", "Wrong Pose", quasi_static=True), 6.0
-        )
-        for m in marks(root / "cube")
-    ]
-    write_points(root / "points", [s for s, _ in both], {s.id: p for s, p in both})
-    return root
 
 
 def plan_of(made, **changes):
@@ -305,77 +271,6 @@ def test_a_button_that_ended_a_trial_is_its_verdict_until_it_is_taken_back(made,
     assert lines[0] == "verdicts so far are by kim; from here on they are by lee"
 
 
-def test_a_clock_that_jumps_is_in_the_row_and_changes_no_duration(made, tmp_path, monkeypatch):
-    import time
-
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
-
-    real, jump = time.time, [0.0]
-    monkeypatch.setattr(time, "time", lambda: real() + jump[0])
-
-    class Jumps(Spoken):
-        def answer(self, screen, details):
-            jump[0] = 3600.0 if screen == "running" else jump[0]
-            return super().answer(screen, details)
-
-    with lab(made) as robot:
-        operator = SimulatedOperator(robot, sd_mm=0.0)
-        rows, _ = go(made, tmp_path, robot, Jumps(operator), stop_after=1)
-    trial = RobotTrial.of_json(rows[0].robot)
-    assert trial.clock_jump_s == pytest.approx(3600, abs=2)
-    assert trial.duration_s < 7
-
-
-def test_a_start_outside_the_tolerance_is_not_run(made, tmp_path):
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
-
-    with lab(made) as robot:
-        careless = SimulatedOperator(robot, sd_mm=0.0, bias_mm=(60.0, 0.0), max_tries=2)
-        rows, lines = go(made, tmp_path, robot, careless, stop_after=1)
-        robot.world.bump("top", (6.0, 0.0))
-        careful = SimulatedOperator(robot, sd_mm=0.0, max_tries=1)
-        bumped, _ = go(made, tmp_path / "bumped", robot, careful, stop_after=1)
-    assert rows[0].outcome == "state_mismatch"
-    assert "objects are" in rows[0].reason
-    assert "not run" in lines[0]
-    assert RobotTrial.of_json(rows[0].robot).attempts >= 2
-    assert "the camera has moved by" in bumped[0].reason
-
-
-def test_a_robot_unplugged_in_mid_trial_leaves_a_row_and_the_run_goes_on_later(made, tmp_path):
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
-
-    with lab(made, unplug_at_step=90) as robot:
-        operator = SimulatedOperator(robot, sd_mm=0.0)
-        with pytest.raises(RobotError, match="does not answer"):
-            go(made, tmp_path, robot, Spoken(operator, running=[]), repeats=20)
-    before = read_trial_log(tmp_path / "trials.jsonl") if (tmp_path / "trials.jsonl").is_file() else []
-    with lab(made) as robot:
-        rows, _ = go(made, tmp_path, robot, SimulatedOperator(robot, sd_mm=0.0), repeats=20, stop_after=1)
-    assert len(rows) == len(before) + 1
-
-
-def test_points_of_another_robot_calibration_or_reach_are_refused(made, tmp_path):
-    from dataclasses import replace
-
-    from lerobot_roborecover.robot.connection import check_point
-    from lerobot_roborecover.robot.points import read_points
-
-    point = read_points(made / "points").points[0]
-    with lab(made) as robot:
-        check_point(point, robot)
-        for change, words in (
-            ({"robot_type": "so101_follower"}, "is of robot 'so101_follower', this one is 'roborecover_lab'"),
-            ({"calibration_sha256": "ab" * 32}, "was recorded with calibration abababababab"),
-            ({"quasi_static": False}, "is not quasi-static"),
-            ({"pictures": {"side": "x"}}, "was seen by camera 'side'"),
-        ):
-            with pytest.raises(RobotError, match=words):
-                check_point(replace(point, **change), robot)
-        with pytest.raises(RobotError, match=r"outside its calibrated -1.0 to 1.0"):
-            check_point(point, robot, {"y.pos": (-1.0, 1.0)})
-
-
 def test_another_program_runs_single_trials_and_its_labels_replace_the_verdicts(made, tmp_path):
     from lerobot_roborecover.robot.fieldtrial import take_labels
     from lerobot_roborecover.robot.lab.operator import SimulatedOperator
@@ -408,12 +303,3 @@ def test_another_program_runs_single_trials_and_its_labels_replace_the_verdicts(
     exported.write_text("no export\n")
     with pytest.raises(ScenarioError, match="is not what `fieldtrial export"):
         take_labels(tmp_path, exported, said.append)
-
-
-def test_a_full_disk_stops_before_a_trial(made, tmp_path, monkeypatch):
-    from lerobot_roborecover.robot.lab.operator import SimulatedOperator
-
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2**30, 2**30, 0))
-    with lab(made) as robot, pytest.raises(RobotError, match="Make room, then start the same command again"):
-        go(made, tmp_path, robot, SimulatedOperator(robot))
-    assert json.loads((tmp_path / "plan.lock.json").read_text())["sha256"]

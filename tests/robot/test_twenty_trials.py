@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from lerobot_roborecover.logs.trial_log import read_trial_log
-from tests.robot.test_run import made  # noqa: F401 - a fixture
 from tests.support.browser import browsing
 from tests.support.doc_blocks import ROOT
 
@@ -67,7 +66,7 @@ class Person:
             self.page.wait_for_timeout(100)
 
 
-def test_twenty_trials(made, tmp_path):  # noqa: F811
+def test_twenty_trials(made, tmp_path):
     plan = {
         "points": str(made / "points"),
         "policies": {"good": str(made / "good"), "worse": str(made / "worse")},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -10,9 +11,11 @@ import time
 
 import pytest
 
+from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.scenario import ScenarioError
 from lerobot_roborecover.utils import atomic_io
 from lerobot_roborecover.utils.atomic_io import atomic_dir, atomic_file, atomic_write, check_new, remove_stale
+from lerobot_roborecover.utils.file_locks import lock_file
 
 
 def names(folder):
@@ -47,6 +50,36 @@ def test_a_file_appears_when_all_of_it_is_written(tmp_path):
         assert path.read_text("utf-8") == "é"
     assert path.read_text() == "whole"
     assert names(path.parent) == ["file.json"]
+
+
+def test_who_replaces_a_file_at_the_same_moment_is_not_in_the_way(tmp_path, monkeypatch):
+    """Two workers keep the same snapshot: neither trial is to end with an error."""
+    path, replace = tmp_path / "key.snapshot", os.replace
+    atomic_write(path, "first")
+
+    def meanwhile(old, new):
+        monkeypatch.setattr(os, "replace", replace)
+        # While this one holds the file to replace it.
+        code = "from pathlib import Path; from lerobot_roborecover.utils import atomic_io as io; "
+        code += f"io.atomic_write(Path({str(path)!r}), 'of the other worker')"
+        subprocess.run([sys.executable, "-c", code], check=True)
+        assert path.read_text() == "of the other worker"
+        replace(old, new)
+
+    monkeypatch.setattr(os, "replace", meanwhile)
+    atomic_write(path, "of this worker")
+    assert path.read_text() == "of this worker"
+    assert names(tmp_path) == ["key.snapshot"]
+
+
+def test_a_file_that_a_process_has_for_itself_is_not_replaced(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    path.write_text("row\n")
+    with open(path) as log:
+        lock_file(log, fcntl.LOCK_EX)
+        with pytest.raises(InUseError, match="in use by another process and is not replaced"):
+            atomic_write(path, "")
+    assert path.read_text() == "row\n"
 
 
 def test_a_block_that_writes_nothing_leaves_what_was_there(tmp_path):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.pages.trial_details import ShownTrial, packed_within
+from lerobot_roborecover.analysis.robot_tables import outcome_words
 from lerobot_roborecover.analysis.stats.estimators import RowsError
 from lerobot_roborecover.analysis.stats.panel import Panel
 from lerobot_roborecover.logs.row import TrialRow
@@ -238,7 +239,7 @@ def _marks(policy: str, rows: Sequence[TrialRow], scheduled: int, initial: Seque
     for row in rows:
         if row.outcome not in _VALID:
             why = f", {row.reason}" if row.reason else ""
-            words += f"; trial {row.trial}: {row.outcome.replace('_', ' ')}{why}"
+            words += f"; trial {row.trial}: {outcome_words(Outcome(row.outcome), row.robot is not None)}{why}"
     shown = "".join(SIGNS[kind] for kind in kinds) + "–" * missing
     return PolicyMarks(policy, shown, words + from_start, signs, kinds.count("success") / scheduled)
 

@@ -94,8 +94,6 @@
     const more = Object.entries(rest).map(([name, value]) => words(name) + " " + value).join(", ");
     return kind + " at step " + step + (more ? " (" + more + ")" : "");
   };
-  const ON_ROBOTS = { horizon: "failure", sim_error: "equipment, or called invalid", state_mismatch: "start too far off" };
-  const ending = (row) => (row.robot && ON_ROBOTS[row.outcome]) || words(row.outcome);
   const startError = (error) => {
     if (!error) return "not measured";
     const joints = Math.max(...Object.values(error.joints).map(Math.abs), 0);
@@ -105,7 +103,7 @@
     return ["worst joint " + joints.toFixed(2), ...cameras].join("; ");
   };
   const facts = (trial, row) => {
-    const found = [["Outcome", ending(row) + " after " + row.steps + " of " + row.horizon + " steps"]];
+    const found = [["Outcome", trial.ending + " after " + row.steps + " of " + row.horizon + " steps"]];
     if (row.reason) found.push(["Reason", row.reason]);
     if (row.robot) {
       found.push(["Start error", startError(row.robot.start_error)]);
@@ -145,7 +143,7 @@
     const row = { ...data.shared, ...trial.row };
     open = { card, data, number };
     const from = trial.start === "initial" ? "the initial state" : "the recovery point";
-    part("title").textContent = trial.policy + ", trial " + (trial.index + 1) + ": " + (row.success ? "solved" : ending(row));
+    part("title").textContent = trial.policy + ", trial " + (trial.index + 1) + ": " + (row.success ? "solved" : trial.ending);
     part("about").textContent = row.instruction + ". " + row.scenario_id + ", from " + from + ".";
     const view = seen(card, trial, row);
     part("seen").replaceChildren(...(view ? [view] : []));

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_roborecover.analysis.pages.page import without_folders
+from lerobot_roborecover.analysis.robot_tables import outcome_words
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
 from lerobot_roborecover.platforms import platform_named
-from lerobot_roborecover.scenario import ScenarioError
+from lerobot_roborecover.scenario import Outcome, ScenarioError
 
 MOST_BYTES = 12 * 2**20
 """Of all packed trials of a page. Scenarios come in the order of their cards: those on which policies
@@ -87,6 +88,7 @@ def packed(trials: Sequence[ShownTrial], folders: Sequence[Path] = ()) -> str:
             "policy": trial.policy,
             "start": trial.start,
             "index": trial.index,
+            "ending": outcome_words(Outcome(trial.row.outcome), trial.row.robot is not None),
             "row": {name: value for name, value in row.items() if name not in shared},
             **_curves(trial.row, folders),
         }

@@ -13,11 +13,9 @@ import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.utils.atomic_io import atomic_write
 from lerobot_roborecover.utils.temporary import TemporaryFolder
@@ -214,8 +212,7 @@ def _private_config(assets: Path) -> Path:
     name = f"libero-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     folder = cache_folder() / name
     try:
-        with suppress(InUseError):  # another process writes the same: the name follows from the content
-            atomic_write(folder / "config.yaml", text)
+        atomic_write(folder / "config.yaml", text)
     except OSError:  # no writable home, as in some containers
         folder = _own_config().path
         atomic_write(folder / "config.yaml", text)

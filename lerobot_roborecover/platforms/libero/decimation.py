@@ -20,7 +20,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from lerobot_roborecover.errors import InUseError
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.utils.atomic_io import atomic_file
 
@@ -84,9 +83,8 @@ def cached_decimation(surface: Surface, faces: int, folder: Path) -> Surface:
             return Surface(*(entry[field.name] for field in fields(Surface)))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         made = decimate(surface, faces)
-    # Without a writable cache, as in some containers, it is made at every load. Another process may be
-    # keeping the same one.
-    with suppress(OSError, InUseError), atomic_file(path) as temporary, temporary.open("wb") as file:
+    # Without a writable cache, as in some containers, it is made at every load.
+    with suppress(OSError), atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **{field.name: getattr(made, field.name) for field in fields(Surface)})
     return made
 

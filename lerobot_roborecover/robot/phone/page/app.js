@@ -1,11 +1,13 @@
 // The console on a phone: asks the server what to show, and tells it what was pressed.
 
 const byId = (id) => document.getElementById(id);
-const VIEWS = ["blend", "difference", "edges", "recorded", "live"];
+const VIEWS = {
+  blend: "blend", difference: "difference", edges: "edges: recorded red, live green", recorded: "recorded", live: "live",
+};
 const SETTLE_MS = 700;
 const STILL = ["rate", "over"]; // screens without a robot that moves
 const WORDS = {
-  go: "Go", skip: "Skip", yes: "Yes", no: "No", done: "Done", success: "Success", failure: "Failure",
+  go: "Go", skip: "Skip this trial", yes: "Yes", no: "No: skip this trial", done: "Done", success: "Success", failure: "Failure",
   invalid: "Invalid", undo: "Undo last verdict", pause: "Pause: end here, go on later", finish: "Finish", mark: "Mark: it went wrong", end: "End",
   takeover: "Take over", handback: "Hand back",
 };
@@ -66,6 +68,7 @@ function button(name, text, action) {
 }
 
 function showScreen(state) {
+  document.activeElement?.blur(); // Enter is not to press what lies where a button was
   document.body.dataset.screen = state.name;
   document.body.dataset.version = state.version;
   byId("instruction").textContent = state.details.instruction || "";
@@ -171,8 +174,8 @@ document.addEventListener("keydown", (event) => {
     press("stop");
   }
 });
-byId("views").replaceChildren(...VIEWS.map((name) => {
-  const made = button(name, name, () => {
+byId("views").replaceChildren(...Object.entries(VIEWS).map(([name, text]) => {
+  const made = button(name, text, () => {
     view = name;
     for (const other of byId("views").children) other.setAttribute("aria-pressed", other.dataset.name === view);
   });
