@@ -148,6 +148,26 @@ def test_an_unscreened_sample_stays_whatever_its_trials_say(
     assert {last[i].verdict for i in sample} == {"kept"}
 
 
+@pytest.mark.lerobot
+def test_trials_are_run_again_and_compared(
+    screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys
+):
+    from tests.support.push_checkpoints import load_push_host
+
+    monkeypatch.setattr("lerobot_roborecover.evaluation.loading.load_host", load_push_host)
+    trials = shutil.copytree(screened.with_name("out.trials"), tmp_path / "trials")
+    more = ("--repeat", "0.3", "--trials-folder", str(trials))
+    assert main(command(scenario_set, checkpoints, tmp_path / "out", *more)) == 0
+    assert "trials of 3 scenarios run again: each with the same actions" in capsys.readouterr().out
+    record = json.loads((tmp_path / "out/meta/roborecover/screening.json").read_text())["repeated"]
+    assert record == {"trials": 3 * 2 * len(checkpoints), "scenarios": 3, "discordant": []}
+    for policy in checkpoints:
+        again = read_trial_log(tmp_path / "trials.again" / policy.name / "trials.jsonl")
+        assert len(again) == 6
+        replayed = {r.scenario_id for r in again if not r.handoff_from_snapshot}
+        assert len(replayed) == 3, "every policy replays the prefixes"
+
+
 @pytest.mark.nightly
 @pytest.mark.lerobot
 def test_curtailed(screened, scenario_set, checkpoints, tmp_path, monkeypatch, capsys):
@@ -227,6 +247,7 @@ def test_what_is_refused(screened, scenario_set, checkpoints, tmp_path, capsys, 
     twice = ["x=" + str(checkpoints[0]), "y=" + str(checkpoints[0])]
     assert "same checkpoint and options" in refused(*command(scenario_set, twice, out))
     assert "use --shard" in refused(*command(scenario_set, checkpoints, out, "--env", "shard=0/2"))
+    assert "from 0 to 1" in refused(*command(scenario_set, checkpoints, out, "--repeat", "5"))
     assert "settles this itself" in refused(
         *command(scenario_set, checkpoints, out, "--env", "start=initial")
     )

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lerobot_roborecover.curation.screen.repeat import draw_repeated, run_again
 from lerobot_roborecover.curation.screen.runs import parse_policies
 from lerobot_roborecover.curation.screen.screening import ScreenRule, count_outcomes, provenance_of, screen
 from lerobot_roborecover.curation.screen.tables import (
@@ -198,6 +199,38 @@ def test_order_does_not_matter(data):
     shuffled = {n: data.draw(st.permutations(rows[n])) for n in data.draw(st.permutations(NAMES))}
     found = screen(data.draw(st.permutations(scenarios)), shuffled, ScreenRule())
     assert {s.scenario.id: s for s in found} == expected
+
+
+def test_trials_that_end_otherwise_the_second_time_are_listed():
+    scenarios = [fake_scenario(i) for i in range(40)]
+    # As early stops leave them: two trials of some scenarios, five of the others.
+    first = merged(*(rows_with(s, dict.fromkeys(NAMES, 1), 2 + 3 * (k % 2)) for k, s in enumerate(scenarios)))
+    ids = draw_repeated([s.id for s in scenarios], 0.05, 1000)
+    assert len(ids) == 2
+    assert ids == draw_repeated([s.id for s in reversed(scenarios)], 0.05, 1000)
+    asked = []
+
+    def again(name: str, trials: int, only: set[str]) -> list:
+        asked.append((name, trials, len(only)))
+        return [r for r in first[name] if r.scenario_id in only]
+
+    same = run_again(first, ids, again)
+    assert same.discordant == ()
+    assert same.trials == sum(trials * scenarios for _, trials, scenarios in asked)
+    changed = min(ids)
+
+    def unsteady(name: str, trials: int, only: set[str]) -> list:
+        return [
+            replace(r, success=not r.success, outcome="horizon" if r.success else "success")
+            if (name, r.scenario_id, r.trial) == ("a", changed, 1)
+            else r
+            for r in again(name, trials, only)
+        ]
+
+    found = run_again(first, ids, unsteady)
+    ends = "horizon after 300 steps, then success after 300 steps"
+    assert found.discordant == (f"a, {changed}, trial 1: {ends}",)
+    assert "1 differ" in str(found)
 
 
 def test_policies_as_they_are_written():

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from lerobot_roborecover.curation.funnel import Decision, attrition_table, count_stages, read_decisions
+from lerobot_roborecover.curation.screen.repeat import Repeats, draw_repeated, run_again
 from lerobot_roborecover.curation.screen.runs import (
     PolicySpec,
     check_policies,
@@ -72,8 +73,11 @@ class ScreenRequest:
     unscreened: int = option(0, metavar="N")
     """So many scenarios, drawn at random, stay whatever the trials say, as split `unscreened`: what screening
     does to ranks is seen on them."""
+    repeat: float = option(0.0, metavar="SHARE")
+    """Run the trials of this share of the scenarios once more, their prefixes replayed again, and list those
+    that end otherwise (in `TRIALS.again`; 0.05 is one in twenty)."""
     run_seed: int = 1000
-    """Run seed of the trials, and seed of that draw."""
+    """Run seed of the trials, and seed of these draws."""
     device: str | None = None
     """Device of the policies."""
     slots: int = option(0, name="num-workers", old=("slots",))
@@ -100,6 +104,8 @@ class ScreenRequest:
         """
         self.workplace.check()
         check_policies(self.policies)
+        if not 0 <= self.repeat <= 1:
+            raise OptionError(f"--repeat {self.repeat}: a share of the scenarios, from 0 to 1")
         unknown = set(self.deterministic) - {p.name for p in self.policies}
         if unknown:
             raise OptionError(
@@ -122,6 +128,8 @@ class Screening:
     """Rows by the policy's name."""
     unscreened: Collection[str] = ()
     """Ids of the sample that stays whatever the trials say."""
+    repeats: Repeats | None = None
+    """None where nothing was run twice."""
 
 
 def screen_dataset(
@@ -156,6 +164,7 @@ def screen_dataset(
     if request.shard:
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic)
+    repeats = _repeats(request, scenarios, rows, progress) if request.repeat else None
     source = Path(request.dataset).expanduser()
     decisions = [_decision(s, sample) for s in found]
     write_stage(
@@ -167,10 +176,31 @@ def screen_dataset(
             if decision.verdict == "kept"
         ],
         decisions,
-        (SCREENING_FILE, _record(found, request, rows, sample)),
+        (SCREENING_FILE, _record(found, request, rows, sample, repeats)),
         scenarios.manifest,
     )
-    return Screening(found, rows, sample)
+    return Screening(found, rows, sample, repeats)
+
+
+def _repeats(
+    request: ScreenRequest,
+    scenarios: ScenarioSet,
+    rows: Mapping[str, Sequence[TrialRow]],
+    progress: Callable[[str, int, int], None],
+) -> Repeats:
+    policies = {p.name: p for p in request.policies}
+    folder = request.trials.with_name(f"{request.trials.name}.again")
+
+    def run(name: str, trials: int, only: set[str]) -> list[TrialRow]:
+        found = run_policy(
+            policies[name], request.dataset, scenarios.platform, folder, trials=trials, only=only,
+            run_seed=request.run_seed, env=request.env, device=request.device, slots=request.slots,
+            max_batch=request.max_batch, replicas=request.replicas, workplace=request.workplace,
+            on_row=lambda row, done, total: progress(f"{name} again", done, total),
+        )  # fmt: skip
+        return [trial.row for trial in found]
+
+    return run_again(rows, draw_repeated([s.id for s in scenarios], request.repeat, request.run_seed), run)
 
 
 def _trials(
@@ -242,7 +272,8 @@ def describe(request: ScreenRequest, made: Screening) -> str:
         format_settled(made.found) if rule.curtail else format_histogram(made.found, rule),
         attrition_table(count_stages(read_decisions(request.out))),
     )
-    return "\n\n".join((head, *tables, next_command(validate_next(request.out, request.trials))))
+    repeats = () if made.repeats is None else (str(made.repeats),)
+    return "\n\n".join((head, *repeats, *tables, next_command(validate_next(request.out, request.trials))))
 
 
 def validate_next(out: Path, trials: Path) -> list[str]:
@@ -272,6 +303,7 @@ def _record(
     request: ScreenRequest,
     rows: Mapping[str, Sequence[TrialRow]],
     sample: Collection[str],
+    repeats: Repeats | None,
 ) -> dict:
     low, high = request.rule.check(len(request.policies))
     return {
@@ -279,6 +311,7 @@ def _record(
         "deterministic": sorted(request.deterministic),
         "run_seed": request.run_seed,
         **({UNSCREENED: sorted(sample)} if sample else {}),
+        **({} if repeats is None else {"repeated": repeats.record}),
         "env": list(request.env),
         "policies": [
             {
