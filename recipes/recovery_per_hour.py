@@ -6,15 +6,14 @@
 A base policy is trained on for as many steps with its own demonstrations and, as often, with corrections:
 none, or 5, 15 or 45 minutes of them as the robot moves. They are other policies' recoveries from the training
 scenarios (`donors`), a scripted operator's who takes over at a drawn step of a clean rollout (`takeover`), or
-the same operator's at steps of trials in which the base fails (`forks`). Every policy runs from the test
-scenarios' recovery points and first states. What is finished is skipped.
+the same operator's at steps of trials in which the base fails (`forks`). Every policy runs from the recovery
+points and first states of the natural test scenarios. What is finished is skipped.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -24,11 +23,9 @@ from types import ModuleType
 from lerobot_roborecover.analysis.figures.style import LINE, colour, dash, drawing, marker, svg_of
 from lerobot_roborecover.curation.split import start_of
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.logs.log_file import open_log
 from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import make_simulator, platform_named
 from lerobot_roborecover.scenario import Source, Start
-from lerobot_roborecover.utils.atomic_io import atomic_write
 from recipes.commands import evaluate, roborecover
 from recipes.corrections import forks
 from recipes.episodes import Episode, draw, frames_of, read_episodes, write_episodes
@@ -96,12 +93,14 @@ class Study:
     def trials(
         self, policy: Path, split: str, folder: Path, *, start: str = "recovery", trials: int = 1
     ) -> Path:
-        """Log of a policy's trials."""
+        """Log of a policy's trials; of the tests those that are a learned policy's own failures."""
         subject = self.subject
+        options = [f"--policy.path={policy}"]
+        if split == "test":
+            options.append(f"--env.select=source={Source.NATURAL.value}")
         return evaluate(
-            subject.platform, subject.scenarios, split, folder, f"--policy.path={policy}", start=start,
-            trials=trials,
-        )  # fmt: skip
+            subject.platform, subject.scenarios, split, folder, *options, start=start, trials=trials
+        )
 
     def corrections(self, source: str) -> list[Episode]:
         """All of a source, made if they are not there."""
@@ -202,33 +201,23 @@ def repeated(episodes: Sequence[Episode], frames: int) -> Iterator[Episode]:
         yield kept
 
 
-def natural(log: Path, out: Path) -> Path:
-    """A log's rows of the scenarios that are a learned policy's own failures."""
-    with open_log(log) as opened:
-        lines = [line for line in opened.file if json.loads(line)["source"] == Source.NATURAL]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(out, b"".join(lines))
-    return out
-
-
 def report(logs: Mapping[str, Path], out: Path) -> None:
-    """Reports on natural failures (the primary question, and all arms) and on all tests; draws the curve.
+    """Reports on the primary question and on all arms; draws the curve.
 
     Args:
         logs: trial logs by run, `ARM_SEED`.
         out: folder to work in.
     """
-    own = {run: natural(log, out / "natural" / f"{run}.jsonl") for run, log in logs.items()}
-    for name, arms, of in (("primary", FIRST_LOOK, own), ("natural", ARMS, own), ("all_tests", ARMS, logs)):
+    for name, arms in (("primary", FIRST_LOOK), ("all", ARMS)):
         named = [
             f"{arm}={','.join(runs)}"
             for arm in arms
-            if (runs := [str(log) for run, log in of.items() if run.rpartition("_")[0] == arm])
+            if (runs := [str(log) for run, log in logs.items() if run.rpartition("_")[0] == arm])
         ]
         if named:
             roborecover("report", *named, "--out", out / "report" / name)
     if len(logs) > len(ARMS):
-        print(f"curve     {draw_curve(out / 'report' / 'natural')}")
+        print(f"curve     {draw_curve(out / 'report' / 'all')}")
 
 
 def draw_curve(folder: Path) -> Path:
@@ -242,9 +231,7 @@ def draw_curve(folder: Path) -> Path:
         plot, axes = subplots(6.4, 3.6)
         for i, source in enumerate(SOURCES):
             arms = [NONE, *(f"{source}_{minutes}" for minutes in MINUTES)]
-            for k, (label, values) in enumerate(
-                zip(("natural failures", "first states"), rates, strict=True)
-            ):
+            for k, (label, values) in enumerate(zip(("recovery points", "first states"), rates, strict=True)):
                 shown = [(place, values[arm]) for place, arm in enumerate(arms) if arm in values]
                 places = [place + 0.06 * (i - 1) for place, _ in shown]
                 middle = [100 * value["value"] for _, value in shown]

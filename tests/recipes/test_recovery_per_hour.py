@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gzip
 import json
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -12,16 +10,14 @@ import numpy as np
 import pytest
 
 from lerobot_roborecover.datasets import load_scenarios
-from lerobot_roborecover.logs.trial_log import read_trial_log
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Start
 from recipes.corrections import forks
 from recipes.episodes import ACTION, REWARD, frames_of
 from recipes.learned import LearnedPolicy
-from recipes.recovery_per_hour import ARMS, SUBJECTS, draw_curve, natural, repeated
+from recipes.recovery_per_hour import ARMS, SUBJECTS, Study, draw_curve, repeated
 from tests.recipes.test_episodes import some
-from tests.support.trial_rows import policy_rows, write_log
 
 SUBJECT = SUBJECTS["metaworld"]
 
@@ -35,15 +31,13 @@ def test_demonstrations_and_corrections_are_as_many_frames_each():
     assert len(ARMS) == 10
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_natural_failures_are_those_of_learned_policies(tmp_path, packed):
-    rows = policy_rows("act", 6, 2, 0.5, 0)
-    rows = [replace(row, source=("natural", "perturbed", "human")[i % 3]) for i, row in enumerate(rows)]
-    log = write_log(tmp_path / "log.jsonl", rows)
-    if packed:
-        log.write_bytes(gzip.compress(log.read_bytes()))
-    kept = read_trial_log(natural(log, tmp_path / "of" / "natural.jsonl"))
-    assert kept == [row for row in rows if row.source == "natural"]
+def test_tests_are_natural_failures(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("recipes.recovery_per_hour.evaluate", lambda *words, **_: asked.append(words))
+    study = Study(SUBJECT, tmp_path)
+    study.trials(SUBJECT.base, "test", tmp_path)
+    study.trials(SUBJECT.base, "train", tmp_path)
+    assert ["--env.select=source=natural" in words for words in asked] == [True, False]
 
 
 def test_the_curve_has_a_line_for_each_source(tmp_path):
@@ -56,7 +50,7 @@ def test_the_curve_has_a_line_for_each_source(tmp_path):
     (tmp_path / "results.json").write_text(json.dumps({"tables": tables}))
     drawn = draw_curve(tmp_path).read_text()
     for source in ("donors", "takeover", "forks"):
-        assert f"<!-- {source}, natural failures -->" in drawn
+        assert f"<!-- {source}, recovery points -->" in drawn
         assert f"<!-- {source}, first states -->" in drawn
 
 
