@@ -1,6 +1,7 @@
 """Which correction data helps most a minute: the recovery rate on natural failures against minutes of it.
 
     python -m recipes.recovery_per_hour --platform metaworld --out outputs/recovery_per_hour
+    python -m recipes.recovery_per_hour --platform libero --out outputs/recovery_per_hour_libero
     python -m recipes.recovery_per_hour --platform metaworld --out outputs/stored --use-stored-outcomes
 
 A base policy is trained on for as many steps with its own demonstrations and, as often, with corrections:
@@ -19,6 +20,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+
+import numpy as np
 
 from lerobot_roborecover.analysis.figures.style import LINE, colour, dash, drawing, marker, svg_of
 from lerobot_roborecover.curation.split import start_of
@@ -76,6 +79,10 @@ SUBJECTS = {
         "metaworld_recovery", Path("policies/study/metaworld_study/policies/act"),
         {"act_clean": 1, "act_few": 1, "tdmpc": 1, "diffusion": 3, "diffusion_few": 3}, "sawyer", 10, 200,
     ),
+    "libero": Subject(
+        "libero_recovery", Path("policies/libero/act_few"),
+        {"act": 1, "act_clean": 1, "act_recover": 1}, "panda", 60, 180,
+    ),
 }  # fmt: skip
 
 
@@ -88,7 +95,7 @@ class Study:
 
     def demonstrations(self) -> list[Episode]:
         """The base's own."""
-        return read_episodes(self.subject.recipes.demonstrations(self.out))
+        return self.subject.recipes.demonstrations(self.out, self.subject.base.name)
 
     def trials(
         self, policy: Path, split: str, folder: Path, *, start: str = "recovery", trials: int = 1
@@ -127,11 +134,15 @@ class Study:
             "--env", "obs_type=state", "--outcome", "successes", "--out", self.out / "corrections" / "donors",
         )  # fmt: skip
 
+    @property
+    def _enough(self) -> float:
+        """Frames of a source: a tenth more than what is drawn at most, for a task may have fewer."""
+        return 1.1 * self.subject.frames(MINUTES[-1])
+
     def _takeover(self) -> Iterator[Episode]:
         scenarios = load_scenarios(self.subject.scenarios, split="train")
         tasks = {(s.task.suite, s.task.name): s.task for s in scenarios}
-        # A tenth more than what is drawn at most: a task may have fewer.
-        each = round(1.1 * self.subject.frames(MINUTES[-1]) / len(tasks))
+        each = round(self._enough / len(tasks))
         return self.subject.recipes.takeovers(
             self.subject.base, [tasks[name] for name in sorted(tasks)], each
         )
@@ -148,11 +159,13 @@ class Study:
                     begun.add(begins)
                     failures.append((scenario, start))
         print(f"the base fails in {len(failures)} trials of the training scenarios", flush=True)
-        subject = self.subject
+        subject, order = self.subject, np.random.default_rng(0).permutation(len(failures))
         simulator = make_simulator(subject.platform, obs_type="state")
-        return forks(
-            simulator, subject.recipes.correction, subject.base, failures, subject.stride, subject.last
-        )
+        made = forks(
+            simulator, subject.recipes.correction, subject.base, [failures[n] for n in order],
+            subject.stride, subject.last,
+        )  # fmt: skip
+        return until(made, self._enough)
 
     def dataset(self, arm: str, seed: int) -> Path:
         """What an arm is trained on: demonstrations and corrections, each as many frames."""
@@ -199,6 +212,16 @@ def repeated(episodes: Sequence[Episode], frames: int) -> Iterator[Episode]:
         kept = episode.cut(frames)
         frames -= len(kept)
         yield kept
+
+
+def until(episodes: Iterable[Episode], frames: float) -> Iterator[Episode]:
+    """Episodes until there are so many frames, the last one whole."""
+    made = 0
+    for episode in episodes:
+        yield episode
+        made += len(episode)
+        if made >= frames:
+            return
 
 
 def report(logs: Mapping[str, Path], out: Path) -> None:

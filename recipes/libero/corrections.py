@@ -10,10 +10,10 @@ import numpy as np
 from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
 from lerobot_roborecover.platforms.simulator import SimulatorError
 from lerobot_roborecover.scenario import Task
-from recipes.episodes import ACTION, ENVIRONMENT, REWARD, STATE, Episode
+from recipes.episodes import ACTION, ENVIRONMENT, REWARD, STATE, Episode, read_episodes
 from recipes.learned import LearnedPolicy
 from recipes.libero.demonstrations import demonstration, expert_episode
-from recipes.libero.train import POLICIES, make_demonstrations
+from recipes.libero.train import POLICIES, episodes, make_demonstrations
 
 FIRST_SEED = 60_000
 """Seeds of the placements whose rollouts are taken over start here; demonstrations use smaller ones."""
@@ -21,10 +21,17 @@ _GIVE_UP_AFTER = 60
 """Rollouts of a task without one more correction."""
 
 
-def demonstrations(out: Path) -> Path:
-    """The dataset of the base policies' demonstrations, made if it is not there."""
-    make_demonstrations(out, POLICIES["act"], workers=2)
-    return out / POLICIES["act"].dataset
+def demonstrations(out: Path, base: str) -> list[Episode]:
+    """Those that a policy has learned from, made if they are not there.
+
+    Args:
+        out: folder to work in.
+        base: its name.
+    """
+    lessons = POLICIES[base]
+    make_demonstrations(out, lessons, workers=2)
+    made, taken = read_episodes(out / lessons.dataset), episodes(lessons, out / lessons.parts)
+    return made if taken is None else [made[n] for n in taken]
 
 
 def takeovers(base: Path, tasks: Iterable[Task], frames: int) -> Iterator[Episode]:

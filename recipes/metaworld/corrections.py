@@ -15,7 +15,7 @@ from lerobot_roborecover.platforms.metaworld.experts import expert, patient_expe
 from lerobot_roborecover.platforms.metaworld.simulator import MetaworldSimulator
 from lerobot_roborecover.scenario import Reset, Task
 from recipes.corrections import drive_on
-from recipes.episodes import Episode
+from recipes.episodes import Episode, read_episodes
 from recipes.learned import LearnedPolicy
 from recipes.metaworld.dataset import record
 from recipes.metaworld.study_policies import make_demonstrations
@@ -45,10 +45,17 @@ def correction(simulator: MetaworldSimulator, task: Task, seed: int) -> Episode 
     return made
 
 
-def demonstrations(out: Path) -> Path:
-    """The dataset of the base policies' demonstrations, made if it is not there."""
+def demonstrations(out: Path, base: str) -> list[Episode]:
+    """Those that a policy has learned from, made if they are not there.
+
+    Args:
+        out: folder to work in.
+        base: its name: `act`, which has learned from all.
+    """
+    if base != "act":
+        raise ValueError(f"{base} has learned from some of the demonstrations; only those of act are known")
     make_demonstrations(out)
-    return out / "demonstrations"
+    return read_episodes(out / "demonstrations")
 
 
 def takeovers(base: Path, tasks: Iterable[Task], frames: int) -> Iterator[Episode]:

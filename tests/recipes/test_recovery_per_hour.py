@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from lerobot_roborecover.datasets import load_scenarios
 from lerobot_roborecover.platforms import make_simulator
@@ -16,7 +17,7 @@ from lerobot_roborecover.scenario import Start
 from recipes.corrections import forks
 from recipes.episodes import ACTION, REWARD, frames_of
 from recipes.learned import LearnedPolicy
-from recipes.recovery_per_hour import ARMS, SUBJECTS, Study, draw_curve, repeated
+from recipes.recovery_per_hour import ARMS, SUBJECTS, Study, draw_curve, repeated, until
 from tests.recipes.test_episodes import some
 
 SUBJECT = SUBJECTS["metaworld"]
@@ -29,6 +30,21 @@ def test_demonstrations_and_corrections_are_as_many_frames_each():
         assert [len(e) for e in made[:-1]] == [lengths[i % len(lengths)] for i in range(len(made) - 1)]
     assert SUBJECT.frames(5) == 5 * 60 * 80
     assert len(ARMS) == 10
+
+
+def test_a_source_stops_when_there_is_enough():
+    assert [len(e) for e in until(some([3, 5, 4, 9], 1.0), 8)] == [3, 5]
+    assert [len(e) for e in until(some([3, 5], 1.0), 80)] == [3, 5]
+
+
+@pytest.mark.parametrize("platform", SUBJECTS)
+def test_what_a_study_needs_is_in_the_clone(platform):
+    subject = SUBJECTS[platform]
+    assert subject.platform == platform
+    for folder in subject.base, *map(subject.base.with_name, subject.donors):
+        assert (folder / "model.safetensors").is_file()
+    config = yaml.safe_load(Path(f"policies/train/recovery_per_hour_{platform}.yaml").read_text())
+    assert config["policy"]["path"] == str(subject.base)
 
 
 def test_tests_are_natural_failures(monkeypatch, tmp_path):
