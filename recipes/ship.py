@@ -1,6 +1,7 @@
 """Copies a trained policy as it ships: half precision, for a CPU, without the training's settings and places.
 
     python -m recipes.ship CHECKPOINT policies/pusht/NAME
+    python -m recipes.ship CHECKPOINT policies/libero/tdmpc_recover --only model._encoder model._pi
 
 LeRobot loads them into float32 again.
 """
@@ -10,10 +11,11 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 
-def ship(checkpoint: Path, out: Path) -> None:
+def ship(checkpoint: Path, out: Path, only: Sequence[str] = ()) -> None:
     """Copies a trained policy in half precision, for a CPU, without the training's settings and places.
 
     LeRobot loads the weights into float32 again, and infers in it: mixed precision, with which a policy may
@@ -22,6 +24,11 @@ def ship(checkpoint: Path, out: Path) -> None:
     Args:
         checkpoint: a `pretrained_model` folder.
         out: folder to write.
+        only: beginnings of the names of the weights that acting needs; none keeps all. LeRobot says at every
+            load which are missing.
+
+    Raises:
+        ValueError: a beginning fits no weight.
     """
     import torch
     from safetensors.torch import load_file, save_file
@@ -30,6 +37,11 @@ def ship(checkpoint: Path, out: Path) -> None:
     for file in sorted(checkpoint.iterdir()):
         if file.name == "model.safetensors":
             weights = load_file(file)
+            for prefix in only:
+                if not any(name.startswith(prefix) for name in weights):
+                    known = sorted({name.rsplit(".", 2)[0] for name in weights})
+                    raise ValueError(f"no weight's name begins with {prefix}; there are {', '.join(known)}")
+            weights = {k: v for k, v in weights.items() if not only or k.startswith(tuple(only))}
             half = {k: v.half() if v.dtype == torch.float32 else v for k, v in weights.items()}
             save_file(half, out / file.name, metadata={"format": "pt"})
         elif file.name == "config.json":
@@ -53,8 +65,12 @@ def main() -> None:
     )
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="PREFIX",
+        help="beginnings of the names of the weights to keep, where acting does not need all",
+    )  # fmt: skip
     args = parser.parse_args()
-    ship(args.checkpoint, args.out)
+    ship(args.checkpoint, args.out, args.only)
 
 
 if __name__ == "__main__":

@@ -45,3 +45,7 @@ def test_ship(tmp_path):
     assert json.loads((tmp_path / "out" / "policy_preprocessor.json").read_text()) == {"device": "cpu"}
     weights = load_file(tmp_path / "out" / "model.safetensors")
     assert (weights["w"].dtype, weights["n"].dtype) == (torch.float16, torch.int64)
+    ship(made, tmp_path / "acts", only=["w"])
+    assert set(load_file(tmp_path / "acts" / "model.safetensors")) == {"w"}
+    with pytest.raises(ValueError, match="begins with v; there are n, w"):
+        ship(made, tmp_path / "never", only=["v"])
