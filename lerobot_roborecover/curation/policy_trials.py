@@ -109,6 +109,11 @@ def run_trials(
     ]
 
 
+def went_alike(one: TrialRow, other: TrialRow) -> bool:
+    """Whether two trials had the same actions and the same outcome."""
+    return (one.outcome, one.actions_sha256) == (other.outcome, other.actions_sha256)
+
+
 def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
     """Checks that a policy which is said to be deterministic did the same in every trial of a scenario.
 
@@ -116,7 +121,7 @@ def check_repeats(name: str, rows: Sequence[TrialRow]) -> None:
         ScenarioError: two trials differ.
     """
     for row in rows[1:]:
-        if (row.outcome, row.actions_sha256) != (rows[0].outcome, rows[0].actions_sha256):
+        if not went_alike(row, rows[0]):
             raise ScenarioError(
                 f"{name} is said to be deterministic, but trials {rows[0].trial} and {row.trial} of "
                 f"{row.scenario_id} differ ({rows[0].outcome} after {rows[0].steps} steps, {row.outcome} "

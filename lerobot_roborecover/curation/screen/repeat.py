@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_roborecover.curation.policy_trials import went_alike
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.utils.text import pluralize
 
@@ -71,15 +72,11 @@ def run_again(rows: Rows, ids: set[str], run: Callable[[str, int, set[str]], Seq
             for row in run(name, trials, {s for s, n in counts.items() if n == trials}):
                 before = mine[row.scenario_id, row.trial]
                 compared += 1
-                if _result(before) != _result(row):
+                if not went_alike(before, row):
                     discordant.append(
                         f"{name}, {row.scenario_id}, trial {row.trial}: {_told(before)}, then {_told(row)}"
                     )
     return Repeats(compared, len(ids), tuple(discordant))
-
-
-def _result(row: TrialRow) -> tuple[str, int, str]:
-    return row.outcome, row.steps, row.actions_sha256
 
 
 def _told(row: TrialRow) -> str:
