@@ -96,6 +96,9 @@ def place_freshly(simulator: LiberoSimulator, task: Task, seed: int) -> dict[str
     built = simulator._task
     drawn = np.random.get_state()
     np.random.seed(seed)
+    # LIBERO adds the drawn pose of a fixture to where its places are: they have to be where the XML has them.
+    for body in built.fixture_bodies.values():
+        built.model.body_pos[body], built.model.body_quat[body] = 0, (1, 0, 0, 0)
     try:
         built._reset_env()
         state, fixtures = built.env.sim.get_state().flatten(), built.fixtures()

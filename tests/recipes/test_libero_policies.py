@@ -49,6 +49,29 @@ def test_a_policy_learns_from_its_share_of_every_task_whatever_there_is_of_it(tm
     assert episodes(POLICIES["act_clean"], tmp_path)[:11] == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 19]
 
 
+@pytest.mark.nightly
+def test_what_stands_on_a_fixture_is_placed_on_it():
+    """LIBERO's stored init states were drawn by the same rule, so a fresh place lies among them."""
+    from lerobot_roborecover.platforms.libero.platform import PLATFORM
+    from lerobot_roborecover.platforms.libero.scene import LiberoScene
+    from lerobot_roborecover.platforms.libero.simulator import LiberoSimulator
+    from lerobot_roborecover.scenario import Reset
+    from recipes.libero.demonstrations import FIRST_SEED, place_freshly
+
+    task = next(t for t in PLATFORM.tasks() if t.name.startswith("pick_up_the_black_bowl_on_the_stove"))
+    simulator = LiberoSimulator(obs_type="state")
+    bowl, stored = "akita_black_bowl_1", []
+    for i in range(0, 50, 5):
+        simulator.reset(task, Reset(1000, i, PLATFORM.settle_steps))
+        stored.append(LiberoScene(simulator).position_m(bowl).copy())
+    for k in range(3):
+        place_freshly(simulator, task, FIRST_SEED + k)
+        placed = LiberoScene(simulator).position_m(bowl)
+        assert np.all(np.abs(placed - np.mean(stored, axis=0))[:2] < 0.06), placed
+        assert placed[2] > 0.9, placed  # metres: on the stove, not on the floor
+    simulator.close()
+
+
 SHIPPED = ROOT / "policies" / "libero"
 
 
