@@ -54,6 +54,8 @@ class StudyDefinition:
     """Name of the scenario set, where it comes with the package."""
     policies_folder: str = ""
     """Of the policies, from the top of a checkout, where they are not the study's own."""
+    learned_folder: str = ""
+    """Of `correction/` and `monitor/`, from the top of a checkout, where they are another study's."""
 
     @property
     def scenarios(self) -> str:
@@ -67,12 +69,16 @@ class StudyDefinition:
     @property
     def correction(self) -> Path:
         """The correction policy's checkpoint."""
-        return self.root / "correction"
+        return self._learned / "correction"
 
     @property
     def monitor(self) -> Path:
         """The monitor's checkpoint."""
-        return self.root / "monitor"
+        return self._learned / "monitor"
+
+    @property
+    def _learned(self) -> Path:
+        return Path(self.learned_folder) if self.learned_folder else self.root
 
     @property
     def outcomes(self) -> Path:
@@ -143,6 +149,7 @@ def write_definition(study: StudyDefinition) -> Path:
         "environment": dict(study.environment),
         **({"dataset": study.dataset} if study.dataset else {}),
         **({"policies_folder": study.policies_folder} if study.policies_folder else {}),
+        **({"learned_folder": study.learned_folder} if study.learned_folder else {}),
     }
     atomic_write(path, json.dumps(found, indent=2) + "\n")
     return path
@@ -154,7 +161,7 @@ def _check(path: Path, study: StudyDefinition) -> None:
     def wrong(name: str, value: object, wanted: str) -> ScenarioError:
         return ScenarioError(f"{path}, field {name}: {value!r:.200}; it must be {wanted}")
 
-    for name in ("dataset", "policies_folder"):
+    for name in ("dataset", "policies_folder", "learned_folder"):
         if not isinstance(getattr(study, name), str):
             raise wrong(name, getattr(study, name), "a text")
     if not isinstance(study.policies, dict) or not study.policies:
@@ -174,8 +181,7 @@ def _check(path: Path, study: StudyDefinition) -> None:
     for mode in study.interventions:
         if mode not in MODES or mode == "human":
             raise wrong("interventions", mode, f"among {[m for m in MODES if m != 'human']}")
-        for part in ("correction", "monitor"):
-            folder = study.root / part
+        for part, folder in (("correction", study.correction), ("monitor", study.monitor)):
             needed = mode.endswith("correction") if part == "correction" else mode.startswith("monitor")
             if needed and not folder.is_dir():
                 raise ScenarioError(f"{path}: mode {mode} needs a {part}, but {folder} is not a folder")

@@ -152,6 +152,7 @@ def test_steps_may_differ_only_where_kernels_cannot_be_chosen(study, tmp_path, m
         ({"env": {"obs_type": 3}}, "field env"),
         ({"dataset": 3}, "field dataset: 3; it must be a text"),
         ({"policies_folder": "policies/none"}, "run this in the top folder of a checkout"),
+        ({"learned_folder": "x", "interventions": ["correction"]}, "needs a correction, but x/correction"),
         ({"colour": "red"}, "not a study's definition"),
     ],
 )  # fmt: skip
@@ -160,6 +161,16 @@ def test_a_definition_that_cannot_be_used(study, changes, message):
     with pytest.raises(ScenarioError, match=r"study\.json") as caught:
         read_definition(study)
     assert message in str(caught.value)
+
+
+def test_a_study_takes_another_s_correction_and_monitor(study, tmp_path):
+    other = tmp_path / "other"
+    (other / "correction").mkdir(parents=True)
+    define(study, learned_folder=str(other), interventions=["correction"])
+    found = read_definition(study)
+    assert (found.correction, found.monitor) == (other / "correction", other / "monitor")
+    write_definition(found)
+    assert read_definition(study) == found
 
 
 @pytest.mark.slow
