@@ -92,6 +92,39 @@ def test_a_collection_is_the_same_however_often_it_is_stopped(tmp_path, monkeypa
     assert twins
 
 
+def frames_of(root):
+    """All columns of a candidate dataset's episodes, row by row."""
+    import pandas
+
+    whole = pandas.concat([pandas.read_parquet(p) for p in sorted(root.glob("data/**/*.parquet"))])
+    assert len(whole)
+    return {name: np.stack(whole[name]).tobytes() for name in whole.columns}
+
+
+@pytest.mark.lerobot
+@pytest.mark.nightly
+@pytest.mark.parametrize("driver", ["expert", "policy"])
+def test_without_pictures_nothing_is_replayed_and_the_dataset_is_the_same(tmp_path, monkeypatch, driver):
+    from lerobot_roborecover.curation.collect import run, write
+
+    who = ["--expert=expert_biased"]
+    if driver == "policy":
+        who = [f"--policy.path={save_policy(tmp_path / 'act')}", "--env.obs_type=state"]
+    common = [*who, "--seeds=0-1", "--frames=none", "--frame-stride=3", "--part-size=3"]
+    with monkeypatch.context() as patch:
+        patch.setattr(write, "map_ordered", lambda *_: pytest.fail("a rollout was replayed"))
+        assert main(arguments(tmp_path / "recorded", *common)) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_sees_what_is_kept", lambda *_: False)
+        assert main(arguments(tmp_path / "replayed", *common)) == 0
+    assert meaning(tmp_path / "recorded") == meaning(tmp_path / "replayed")
+    assert frames_of(tmp_path / "recorded") == frames_of(tmp_path / "replayed")
+    # Records of a run that observed nothing are replayed, in the same folders.
+    work = f"--work={tmp_path / 'replayed.work'}"
+    assert main(arguments(tmp_path / "again", *common, work)) == 0
+    assert frames_of(tmp_path / "again") == frames_of(tmp_path / "replayed")
+
+
 @pytest.mark.lerobot
 @pytest.mark.nightly
 def test_a_policy_collects_the_same_whatever_the_slots(tmp_path, capsys):
@@ -156,6 +189,11 @@ def test_something_else_in_the_folder_is_left_alone(tmp_path, capsys):
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
+def dtypes(observation):
+    """Of its arrays, by the same keys."""
+    return {k: dtypes(v) if isinstance(v, dict) else v.dtype for k, v in observation.items()}
+
+
 @pytest.mark.metaworld
 def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
     from lerobot_roborecover.curation.collect.server import CollectServer, VideoJob
@@ -168,7 +206,7 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
 
     tasks = choose_tasks(platform_named("metaworld").tasks(), ["reach-wall-v3", "push-v3"])
     made = make_units(tasks, Starts(seeds=(0,)), "expert_biased", np.zeros(4), perturbed=True)
-    settings = {"seed": 7, "expert": "expert_biased"}
+    settings = {"seed": 7, "expert": "expert_biased", "observe_every": 1}
     server = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}, settings=settings))
     renderer = CollectServer(SlotConfig("metaworld", {"obs_type": "state"}))
     flags = set()
@@ -181,7 +219,12 @@ def test_metaworld_perturbed_and_replayed_exactly(tmp_path):
         job = VideoJob(
             Rollout(scenario.task, record.reset, record.actions), tuple(record.steps.bodies), poses
         )
-        assert ask(renderer, "render", job).error_m == 0.0
+        replayed = ask(renderer, "render", job)
+        assert replayed.error_m == 0.0
+        assert len(record.observations) == len(replayed.observations) == len(record.actions)
+        for ours, theirs in zip(record.observations, replayed.observations, strict=True):
+            np.testing.assert_equal(ours, theirs)
+            assert dtypes(ours) == dtypes(theirs)
         box = record.workspace
         inside = record.actions[record.steps.perturbation == PERTURBED]
         assert len(inside)
@@ -223,6 +266,31 @@ def test_libero_reach_ends_with_the_arm_and_changes_nothing():
     box = simulator.workspace()
     assert box.low_m[:2] == (-0.5, -0.6)  # LIBERO's kitchen table
     assert box.support_m == 0.9
+
+
+@pytest.mark.nightly
+@pytest.mark.libero
+def test_libero_s_rollouts_record_what_their_replays_see(tmp_path):
+    from lerobot_roborecover.curation.collect.server import CollectServer, VideoJob
+    from lerobot_roborecover.curation.collect.starts import make_units
+    from lerobot_roborecover.platforms.libero import PLATFORM
+    from lerobot_roborecover.platforms.starts import Starts
+    from lerobot_roborecover.workers.messages import SlotConfig
+    from tests.curation.test_collect import ask, drive
+
+    task = Task("libero", "libero_goal", "put_the_bowl_on_the_plate", "put the bowl on the plate", 40)
+    (made,) = make_units([task], Starts(init_states=(3,)), "scripted", PLATFORM.no_op(), perturbed=True)
+    settings = {"seed": 7, "expert": "scripted", "observe_every": 1}
+    server = CollectServer(SlotConfig("libero", {"obs_type": "state"}, settings=settings))
+    drive(server, tmp_path, made)
+    record = read_record(tmp_path / f"{made.id}.npz")
+    poses = np.stack(list(record.steps.bodies.values()))
+    job = VideoJob(Rollout(task, record.reset, record.actions), tuple(record.steps.bodies), poses)
+    replayed = ask(CollectServer(SlotConfig("libero", {"obs_type": "state"})), "render", job)
+    assert replayed.error_m == 0.0
+    for ours, theirs in zip(record.observations, replayed.observations, strict=True):
+        np.testing.assert_equal(ours, theirs)
+        assert dtypes(ours) == dtypes(theirs)
 
 
 @pytest.mark.lerobot

@@ -3,7 +3,7 @@
 1. Everything that can be refused is refused before a simulator starts.
 2. Rollouts, through the fast runner; each is a record and a journal's line once it has ended.
 3. Each finished rollout is judged, from its record alone.
-4. What is kept is replayed with pictures and written in parts.
+4. What is kept is written in parts, replayed where pictures are wanted.
 5. The parts become the dataset, with a decision on every rollout.
 
 Each of these goes on where it was stopped, and gives the same whatever the number of slots.

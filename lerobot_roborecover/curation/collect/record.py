@@ -11,6 +11,7 @@ import io
 import json
 import os
 import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,13 @@ from lerobot_roborecover.curation.collect.starts import RolloutSpec
 from lerobot_roborecover.curation.rollout import PERTURBED_STEPS, perturb_translations
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.limits import Workspace, limits_of
-from lerobot_roborecover.platforms.simulator import Simulator
+from lerobot_roborecover.platforms.simulator import Observation, Simulator
 from lerobot_roborecover.platforms.starts import stream
 from lerobot_roborecover.replay.recorder import PERTURBED, UNPERTURBED, UNREACHABLE, Recorder, Steps
 from lerobot_roborecover.scenario import Outcome, Reset, ScenarioError
+
+_SEEN = "seen/"
+"""Begins the names of a record's arrays that are of observations."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class RecorderSettings:
     """Name of the scripted controller; empty where a policy drives."""
     perturbed_steps: int = PERTURBED_STEPS
     """Leading interaction steps in which actions are perturbed."""
+    observe_every: int = 0
+    """Actions from one recorded observation to the next; 0 records none."""
 
 
 @dataclass
@@ -52,6 +58,10 @@ class Record:
     """(T + 1,) float64: distance of the arm's joints from their limits; NaN where unknown."""
     workspace: Workspace | None
     """Workspace of the reset, where the simulator knows it."""
+    observations: list[Observation] | None = None
+    """T raw observations, one before each action; None where none were recorded."""
+    observe_every: int = 0
+    """As in `RecorderSettings`."""
     solved_after: int | None = field(init=False)
     """Actions after which the task's predicate first held, or None."""
 
@@ -91,6 +101,11 @@ def pack_record(record: Record) -> bytes:
         "bodies": list(record.steps.bodies),
         "reset": record.reset.as_json(),
         "workspace": None if record.workspace is None else asdict(record.workspace),
+        "observe_every": record.observe_every,
+    }
+    seen = [dict(_leaves(o)) for o in record.observations or ()]
+    of_seen: dict[str, Any] = {
+        f"{_SEEN}{name}": np.stack([o[name] for o in seen]) for name in (seen[0] if seen else ())
     }
     file = io.BytesIO()
     np.savez_compressed(
@@ -101,6 +116,7 @@ def pack_record(record: Record) -> bytes:
         solved=record.steps.solved,
         perturbation=record.steps.perturbation,
         margin_rad=record.margin_rad,
+        **of_seen,
     )
     return file.getvalue()
 
@@ -128,11 +144,36 @@ def read_record(path: Path) -> Record:
             None
             if place is None
             else Workspace(tuple(place["low_m"]), tuple(place["high_m"]), place["support_m"]),
+            _observations({k.removeprefix(_SEEN): a for k, a in arrays.items() if k.startswith(_SEEN)}),
+            about.get("observe_every", 0),  # files of earlier versions have none
         )
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as err:
         raise ScenarioError(
             f"{path} is not a rollout's record ({err!s:.200}). Delete it: the same command rolls out again"
         ) from None
+
+
+def _leaves(observation: Observation, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """An observation's arrays by path."""
+    for name, value in observation.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(dict(value), f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _observations(arrays: Mapping[str, np.ndarray]) -> list[Observation] | None:
+    """T observations again, of arrays by path with a leading dimension T."""
+    if not arrays:
+        return None
+    found: list[Observation] = [{} for _ in range(len(next(iter(arrays.values()))))]
+    for path, values in arrays.items():
+        *parents, name = path.split("/")
+        for whole, value in zip(found, values, strict=True):
+            for parent in parents:
+                whole = whole.setdefault(parent, {})
+            whole[name] = value
+    return found
 
 
 class RecordingSimulator:
@@ -170,10 +211,13 @@ class RecordingSimulator:
         if self._plan.disturbed:
             self._noise = stream(self._settings.seed, "perturbation", task, reset, self._plan.trial)
         self._settling, self._last = reset.settle_steps, reset.settle_steps + task.horizon
+        self._seen: list[Observation] = []
         self._margins = [self._margin_rad()]
 
     def step(self, action: np.ndarray) -> None:
         """Perturbs, executes in float64, records."""
+        if every := self._settings.observe_every:
+            self._seen.append(self._seen[-1] if len(self._recorder) % every else self.inner.observe())
         self._recorder.step(*self._disturbed(np.array(action, dtype=np.float64)))
         self._margins.append(self._margin_rad())
 
@@ -204,4 +248,6 @@ class RecordingSimulator:
             self._recorder.steps,
             np.array(self._margins),
             None if self._limits is None else self._limits.workspace(),
+            self._seen or None,
+            self._settings.observe_every,
         )

@@ -85,7 +85,8 @@ def roll_out(
             progress.total -= 1
         line.show(progress)
 
-    settings = asdict(RecorderSettings(options.seed, options.expert, options.perturb_steps))
+    every = options.frame_stride if _sees_what_is_kept(options, spec) else 0
+    settings = asdict(RecorderSettings(options.seed, options.expert, options.perturb_steps, every))
     slot = replace(spec.slot, server=SERVER, settings=settings)
     draws = getattr(env, "obs_type", "state") != "state"
     pool = SlotPool(slot, workers=True, timeout_s=options.watchdog_s)
@@ -189,6 +190,7 @@ def render_and_write(
             versions=versions,
             frames=f"{options.frames}/{options.frame_stride}",
             video=VideoSettings(options.frame_stride, slot.options),
+            replay=not _sees_what_is_kept(options, spec),
             part_size=options.part_size,
             description=options.description,
             license=options.license,
@@ -207,6 +209,12 @@ def render_and_write(
         ) from err
     finally:
         pool.release()
+
+
+def _sees_what_is_kept(options: CollectOptions, spec: SimulatorSpec) -> bool:
+    """Whether the simulator that rolls out observes what the dataset is to hold, and no pictures: then it is
+    recorded on the way, and nothing has to be replayed for it."""
+    return not options.frames and _render_options(options, spec) == spec.slot.options
 
 
 def _render_options(options: CollectOptions, spec: SimulatorSpec) -> dict[str, Any]:

@@ -54,6 +54,8 @@ class WriterConfig:
     """What is rendered; names the parts, so that another size is rendered anew."""
     video: VideoSettings
     """Kept with every candidate, so that what was seen can be rendered again."""
+    replay: bool = True
+    """Replay rollouts whose records have these observations too: they have no pictures."""
     part_size: int = 20
     """Candidates of a part: what is lost, at most, when the writing is stopped."""
     description: str = ""
@@ -183,8 +185,12 @@ def _rendered(
             writing.video.every,
         )
 
-    workers = writing.pool.worker_slots(min(writing.slots, len(chunk)))
-    for v, rendered in zip(chunk, map_ordered(workers, "render", chunk, job), strict=True):
+    seen = {} if writing.replay else _recorded(chunk, writing)
+    unseen = [v for v in chunk if v.planned.id not in seen]
+    workers = writing.pool.worker_slots(min(writing.slots, len(unseen))) if unseen else []
+    replayed = map_ordered(workers, "render", unseen, job) if unseen else iter(())
+    for v in chunk:
+        rendered = seen.get(v.planned.id) or next(replayed)
         if failed(rendered):
             lost[v.planned.id] = "could not be replayed", failed(rendered)[:500]
             continue
@@ -197,6 +203,17 @@ def _rendered(
             continue
         record = read_record(record_path(writing.records, v.planned.id))
         yield _recording(v, record, rendered, writing.video)
+    assert next(replayed, None) is None
+
+
+def _recorded(chunk: Sequence[RolloutVerdict], writing: WriterConfig) -> dict[str, RenderedRollout]:
+    """What the rollouts themselves have seen, by id."""
+    found = {}
+    for v in chunk:
+        record = read_record(record_path(writing.records, v.planned.id))
+        if record.observations is not None and record.observe_every == writing.video.every:
+            found[v.planned.id] = RenderedRollout(record.observations, 0.0)
+    return found
 
 
 def _recording(
