@@ -14,6 +14,7 @@ from lerobot_roborecover.curation.collect.judge import (
     verdict,
 )
 from lerobot_roborecover.curation.collect.record import (
+    pack_record,
     read_record,
     record_path,
 )
@@ -233,6 +234,24 @@ def test_a_replay_is_compared_with_the_rollout(tmp_path):
     shifted = poses.copy()
     shifted[0, 7, 1] += 0.01
     assert ask(plain, "render", replace(job, poses=shifted)).error_m == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    "odd", ["push it", [{"at": 1.0}], np.zeros((4, 4, 3), np.uint8), np.array([None])]
+)  # fmt: skip
+def test_observations_that_are_no_numbers_are_left_to_a_replay(tmp_path, odd):
+    server = CollectServer(replace(config(), settings={**config().settings, "observe_every": 2}))
+    (planned, *_) = units()
+    drive(server, tmp_path, planned)
+    record = read_record(record_path(tmp_path, planned.record_name))
+    assert len(record.observations) == len(record.actions)
+    np.testing.assert_equal(record.observations[1], record.observations[0])
+    again = tmp_path / "again.npz"
+    again.write_bytes(pack_record(record))
+    np.testing.assert_equal(read_record(again).observations, record.observations)
+    record.observations = [{**o, "more": {"odd": odd}} for o in record.observations]
+    again.write_bytes(pack_record(record))
+    assert read_record(again).observations is None
 
 
 def test_damaged_records_say_so(tmp_path):

@@ -164,13 +164,11 @@ def test_a_definition_that_cannot_be_used(study, changes, message):
 
 
 def test_a_study_takes_another_s_correction_and_monitor(study, tmp_path):
-    other = tmp_path / "other"
-    (other / "correction").mkdir(parents=True)
-    define(study, learned_folder=str(other), interventions=["correction"])
-    found = read_definition(study)
-    assert (found.correction, found.monitor) == (other / "correction", other / "monitor")
-    write_definition(found)
+    (tmp_path / "other" / "correction").mkdir(parents=True)
+    define(study, learned_folder=str(other := tmp_path / "other"), interventions=["correction"])
+    write_definition(found := read_definition(study))
     assert read_definition(study) == found
+    assert (found.correction, found.monitor) == (other / "correction", other / "monitor")
 
 
 @pytest.mark.slow

@@ -104,6 +104,8 @@ def pack_record(record: Record) -> bytes:
         "observe_every": record.observe_every,
     }
     seen = [dict(_leaves(o)) for o in record.observations or ()]
+    if not all(_is_numbers(value) for value in (seen[0].values() if seen else ())):
+        seen = []  # what the file does not hold is seen in a replay
     of_seen: dict[str, Any] = {
         f"{_SEEN}{name}": np.stack([o[name] for o in seen]) for name in (seen[0] if seen else ())
     }
@@ -160,6 +162,11 @@ def _leaves(observation: Observation, prefix: str = "") -> Iterator[tuple[str, n
             yield from _leaves(dict(value), f"{prefix}{name}/")
         else:
             yield f"{prefix}{name}", value
+
+
+def _is_numbers(value: Any) -> bool:
+    """Whether an observation's leaf comes out of a record's file as it went in, and is no picture."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.ndim < 3
 
 
 def _observations(arrays: Mapping[str, np.ndarray]) -> list[Observation] | None:

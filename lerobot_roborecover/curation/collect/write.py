@@ -174,8 +174,16 @@ def _rendered(
 ) -> Iterator[Recording]:
     """Recordings of a part, as they are rendered; notes those that are lost, and why."""
 
+    records = {v.planned.id: read_record(record_path(writing.records, v.planned.id)) for v in chunk}
+
+    def seen(v: RolloutVerdict) -> RenderedRollout | None:
+        record = records[v.planned.id]
+        if writing.replay or record.observations is None or record.observe_every != writing.video.every:
+            return None
+        return RenderedRollout(record.observations, 0.0)
+
     def job(v: RolloutVerdict) -> VideoJob:
-        record = read_record(record_path(writing.records, v.planned.id))
+        record = records[v.planned.id]
         poses = record.steps.bodies
 
         return VideoJob(
@@ -185,12 +193,11 @@ def _rendered(
             writing.video.every,
         )
 
-    seen = {} if writing.replay else _recorded(chunk, writing)
-    unseen = [v for v in chunk if v.planned.id not in seen]
+    unseen = [v for v in chunk if seen(v) is None]
     workers = writing.pool.worker_slots(min(writing.slots, len(unseen))) if unseen else []
     replayed = map_ordered(workers, "render", unseen, job) if unseen else iter(())
     for v in chunk:
-        rendered = seen.get(v.planned.id) or next(replayed)
+        rendered = seen(v) or next(replayed)
         if failed(rendered):
             lost[v.planned.id] = "could not be replayed", failed(rendered)[:500]
             continue
@@ -201,19 +208,8 @@ def _rendered(
                 f"up to {1e3 * rendered.error_m:.2f} mm apart (limit {1e3 * HANDOFF_TOLERANCE_M:g} mm)",
             )
             continue
-        record = read_record(record_path(writing.records, v.planned.id))
-        yield _recording(v, record, rendered, writing.video)
+        yield _recording(v, records[v.planned.id], rendered, writing.video)
     assert next(replayed, None) is None
-
-
-def _recorded(chunk: Sequence[RolloutVerdict], writing: WriterConfig) -> dict[str, RenderedRollout]:
-    """What the rollouts themselves have seen, by id."""
-    found = {}
-    for v in chunk:
-        record = read_record(record_path(writing.records, v.planned.id))
-        if record.observations is not None and record.observe_every == writing.video.every:
-            found[v.planned.id] = RenderedRollout(record.observations, 0.0)
-    return found
 
 
 def _recording(
