@@ -176,7 +176,7 @@ def plain_install(tmp_path: Path) -> Path:
 
     root = Path(__file__).parents[2]
     tree = tmp_path / "tree"
-    skip = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    skip = shutil.ignore_patterns("__pycache__", "*.egg-info", "*_recovery")  # the large sets
     shutil.copytree(root / "lerobot_roborecover", tree / "lerobot_roborecover", ignore=skip)
     for name in ("pyproject.toml", "README.md", "LICENSE", "lerobot_env_roborecover.py"):
         shutil.copy(root / name, tree)
@@ -185,6 +185,7 @@ def plain_install(tmp_path: Path) -> Path:
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
+    assert list(tmp_path.glob("site/lerobot_roborecover/data/*_starter/**/scenarios.parquet"))
     code = "import lerobot_roborecover; print(lerobot_roborecover.__file__)"
     found = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path,

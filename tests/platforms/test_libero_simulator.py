@@ -94,9 +94,8 @@ def test_reset_steps_and_pictures_equal_a_fresh_robosuite_environment(sim, offsc
         assert sim.succeeded() == theirs.check_success()
 
 
-@pytest.mark.parametrize(
-    ("suite", "index"), [("libero_spatial", 4), pytest.param("libero_10", 9, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize(("suite", "index"), [("libero_spatial", 4), ("libero_10", 9)])
 def test_step_is_bit_identical_to_robosuites(sim, suite, index):
     quiet_import(find_assets())
     from libero.libero.envs.env_wrapper import ControlEnv
