@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lerobot_roborecover.curation.screen import dataset
 from lerobot_roborecover.curation.screen.repeat import draw_repeated, run_again
 from lerobot_roborecover.curation.screen.runs import parse_policies
 from lerobot_roborecover.curation.screen.screening import ScreenRule, count_outcomes, provenance_of, screen
@@ -18,7 +20,9 @@ from lerobot_roborecover.curation.screen.tables import (
     format_settled,
     histogram,
 )
+from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.logs.row import LoggedTrial
 from lerobot_roborecover.scenario import ScenarioError
 from tests.support.factories import fake_scenario
 from tests.support.trial_rows import trial_row
@@ -251,3 +255,41 @@ def test_policies_as_they_are_written():
     ):
         with pytest.raises(OptionError, match=words):
             parse_policies(["a=org/x"], **bad)
+
+
+@pytest.mark.parametrize("curtail", [False, True])
+def test_hard_scenarios_go_to_the_first_policy_and_easy_ones_to_the_last(tmp_path, monkeypatch, curtail):
+    """Of four the first two do the same every time: both fail in one scenario, both succeed in another."""
+    hard, easy, between = scenarios = [fake_scenario(i) for i in range(3)]
+    wins = {
+        hard.id: {"a": 0, "b": 0, "c": 4, "d": 1},
+        easy.id: {"a": 5, "b": 5, "c": 4, "d": 1},
+        between.id: {"a": 5, "b": 0, "c": 4, "d": 1},
+    }
+    tried: list[tuple[str, str, int]] = []
+
+    def run_policy(policy, *_, trials, only, **__):
+        rows = []
+        for scenario in scenarios:
+            if only is None or scenario.id in only:
+                all_five = rows_with(scenario, wins[scenario.id])[policy.name]
+                rows += [LoggedTrial(row, np.zeros((row.steps, 7))) for row in all_five[:trials]]
+                tried.append((scenario.id, policy.name, trials))
+        return rows
+
+    monkeypatch.setattr(dataset, "run_policy", run_policy)
+    write_scenarios(tmp_path / "set", scenarios)
+    dataset.screen_dataset(
+        dataset.ScreenRequest(
+            dataset=str(tmp_path / "set"), out=tmp_path / "out", rule=ScreenRule(curtail=curtail),
+            policies=parse_policies([f"{name}=x/{name}" for name in NAMES])[0], deterministic=["a", "b"],
+        )
+    )  # fmt: skip
+    assert len(read_scenarios(tmp_path / "out")) == 3
+    if curtail:
+        certain = {(s.id, name, 1) for s in scenarios for name in "ab"}
+        assert set(tried) == certain | {
+            (hard.id, "c", 2), (easy.id, "d", 1), (easy.id, "d", 3), (between.id, "d", 1)
+        }  # fmt: skip
+    else:
+        assert set(tried) == {(s.id, n, 1 if n in "ab" else 5) for s in scenarios for n in NAMES}

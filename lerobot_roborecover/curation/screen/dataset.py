@@ -215,7 +215,8 @@ def _trials(
     go on from its handoff.
 
     A curtailed screening takes one policy after the other, those that need one trial only first, and as many
-    trials of each as may settle some verdict, of the scenarios that are open then.
+    trials of each as may settle some verdict, of the scenarios that are open then. Scenarios that lack
+    successes get trials of the first policy first, those that lack failures of the last.
     """
     rule, started = request.rule, False
     rows: dict[str, dict[tuple, TrialRow]] = {p.name: {} for p in request.policies}
@@ -237,20 +238,28 @@ def _trials(
         so_far = {name: list(of.values()) for name, of in rows.items()}
         return [s for s in count_outcomes(scenarios, so_far, rule, request.deterministic) if not s.settled]
 
-    for policy in sorted(
-        request.policies, key=lambda p: rule.curtail and p.name not in request.deterministic
-    ):
+    def lacking() -> list[Screened]:
+        return [s for s in undecided() if s.successes < rule.bounds(len(rows))[0]]
+
+    def settle(policy: PolicySpec, find_open: Callable[[], list[Screened]]) -> None:
         most = 1 if policy.name in request.deterministic else rule.trials
         trials = 0
-        while trials < most:
-            if not rule.curtail:
-                trials, only = most, None
-            elif left := undecided():
-                trials = min(trials + min(s.soonest for s in left), most)
-                only = {s.scenario.id for s in left}
-            else:
-                break
-            run(policy, trials, only)
+        while trials < most and (left := find_open()):
+            trials = min(trials + min(s.soonest for s in left), most)
+            run(policy, trials, {s.scenario.id for s in left})
+
+    certain = [p for p in request.policies if p.name in request.deterministic]
+    others = [p for p in request.policies if p.name not in request.deterministic]
+    if rule.curtail:
+        for policy in certain:
+            settle(policy, undecided)
+        for policy in others:
+            settle(policy, lacking)
+        for policy in reversed(others):
+            settle(policy, undecided)
+    else:
+        for policy in request.policies:
+            run(policy, 1 if policy in certain else rule.trials, None)
     return {name: list(of.values()) for name, of in rows.items()}
 
 

@@ -47,7 +47,8 @@ class ScreenRule:
     """
     curtail: bool = option(False, name="early-stop", old=("curtail",))
     """Stop trying a scenario once no further trial could change whether it stays (after three, which
-    validation replays): the same scenarios stay after fewer trials; deterministic policies come first.
+    validation replays): the same scenarios stay after fewer trials; deterministic policies come first. Name
+    the best policy first: it is tried on the hard scenarios, the last on the easy ones.
 
     A trial that is invalid can still change a verdict.
     """
