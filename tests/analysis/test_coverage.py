@@ -48,8 +48,11 @@ def benchmark():
 @pytest.mark.parametrize(
     "part",
     [
-        *("rates", "retries", "tasks", "macro", "ratios", "steps", "tests"),
-        *(pytest.param(part, marks=pytest.mark.nightly) for part in ("differences", "agreement")),
+        *("rates", "retries", "macro", "steps"),
+        *(
+            pytest.param(part, marks=pytest.mark.nightly)
+            for part in ("tasks", "ratios", "tests", "differences", "agreement")
+        ),
     ],
 )
 def test_intervals_cover_and_tests_are_right(benchmark, part):

@@ -24,7 +24,7 @@ def taken(steps, units=None, level=0.95):
 
 
 @pytest.mark.parametrize("sizes", [[1] * 11, [1, 2, 3, 1, 2, 5, 4, 3, 2, 1, 1]])
-@pytest.mark.parametrize("level", [0.95, 0.8])
+@pytest.mark.parametrize("level", [0.95, pytest.param(0.8, marks=pytest.mark.nightly)])
 def test_the_error_over_all_looks_is_exactly_within_the_level(sizes, level):
     """Every pattern of signs is as likely under "the two are alike": so many of them may decide, no more."""
     decided = [

@@ -59,6 +59,7 @@ def fail_like_a_simulator(simulator, scenario):
     return {}
 
 
+@pytest.mark.nightly
 def test_an_unforeseen_error_of_a_simulator_is_one_result_too(tmp_path):
     found = fingerprint_scenarios([bare(i) for i in range(3)], tmp_path / "log", check=fail_like_a_simulator)
     assert [r.error for r in found] == ["", "IndexError: contact buffer", ""]

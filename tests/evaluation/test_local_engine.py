@@ -81,7 +81,10 @@ def reference(dataset, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("slots", "max_batch"), [(1, 64), (2, 1), (4, 2), (5, 64)])
+@pytest.mark.parametrize(
+    ("slots", "max_batch"),
+    [(4, 2), *(pytest.param(*sizes, marks=pytest.mark.nightly) for sizes in ((1, 64), (2, 1), (5, 64)))],
+)
 def test_the_same_rows_as_lerobots_loop(dataset, reference, tmp_path, slots, max_batch):
     host = PushHost(max_batch)
     assert outcomes(run_engine(dataset, tmp_path / "log.jsonl", slots=slots, host=host)) == reference

@@ -202,8 +202,8 @@ def test_non_finite_and_misshapen_actions_become_policy_errors(dataset, tmp_path
 @pytest.mark.parametrize(
     ("task", "outcome", "words"),
     [
-        ("raises", "sim_error", "broke on purpose"),
-        ("exits", "sim_error", "exit status 3"),
+        pytest.param("raises", "sim_error", "broke on purpose", marks=pytest.mark.nightly),
+        pytest.param("exits", "sim_error", "exit status 3", marks=pytest.mark.nightly),
         ("hangs", "timeout", "did not answer within 2 s"),
     ],
 )

@@ -22,7 +22,7 @@ SETS = [
 ]
 FEW = [
     pytest.param("metaworld_starter", 4, marks=pytest.mark.metaworld),
-    pytest.param("metaworld_study", 3, marks=pytest.mark.metaworld),
+    pytest.param("metaworld_study", 3, marks=[pytest.mark.metaworld, pytest.mark.nightly]),
     pytest.param("metaworld_recovery", 3, marks=pytest.mark.metaworld),
     pytest.param("libero_starter", 3, marks=[pytest.mark.libero, pytest.mark.slow, pytest.mark.nightly]),
     pytest.param("libero_recovery", 3, marks=[pytest.mark.libero, pytest.mark.slow]),
