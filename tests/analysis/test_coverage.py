@@ -48,10 +48,10 @@ def benchmark():
 @pytest.mark.parametrize(
     "part",
     [
-        *("rates", "retries", "macro", "steps"),
+        *("rates", "retries", "macro", "steps", "tests"),
         *(
             pytest.param(part, marks=pytest.mark.nightly)
-            for part in ("tasks", "ratios", "tests", "differences", "agreement")
+            for part in ("tasks", "ratios", "differences", "agreement")
         ),
     ],
 )

@@ -274,7 +274,6 @@ def videos(out: Path) -> dict[str, int]:
     return found
 
 
-@pytest.mark.nightly
 def test_videos_of_failures_are_bounded_and_whole(run, whole):
     out = run("--videos=3", "--env.obs_type=state")
     found = videos(out)

@@ -139,7 +139,6 @@ def test_the_example_runs_without_an_account(capsys):
     assert "recovery/success 0" in line
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(("tracker", "log"), [("wandb", "sdk.wandb_run.Run.log"), ("trackio", "log")])
 def test_trackers_take_the_call(tracker, log):
     module = pytest.importorskip(tracker, reason=f"{tracker} is not installed: pip install {tracker}")

@@ -92,7 +92,6 @@ def test_another_number_of_inference_steps(run, tmp_path, capfd):
     assert "policy setting num_inference_steps is 3" in capfd.readouterr().err
 
 
-@pytest.mark.nightly
 def test_a_corrected_rename_map(run, tmp_path):
     policy = save_policy(tmp_path / "act")
     wrong = '--rename_map={"observation.image": "observation.images.wrong"}'

@@ -102,8 +102,9 @@ def test_each_scenario_says_how_it_came_about(scenarios, wanted):
         assert s.provenance["screening"]["policies"].keys() == wanted.panel
 
 
-def test_libero_s_settle_as_libero_does():
-    for s in read_scenarios(SETS["libero_recovery"].root):
+@pytest.mark.parametrize("name", ["libero_recovery"], indirect=True)
+def test_libero_s_settle_as_libero_does(scenarios):
+    for s in scenarios:
         assert s.task.horizon == LIBERO_HORIZONS[s.task.suite]
         assert np.array_equal(s.prefix[:10], np.tile([0, 0, 0, 0, 0, 0, -1.0], (10, 1)))
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from functools import cache
 
 import pytest
 
@@ -15,6 +16,8 @@ from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import SnapshotCache, hand_off
 from lerobot_roborecover.scenario import Start
 from tests.support.exactness import PINNED, as_recorded, states_in_a_fresh_process
+
+load = cache(load_scenarios)
 
 SETS = [
     pytest.param("metaworld_starter", marks=pytest.mark.metaworld),
@@ -50,7 +53,7 @@ STRAY = {"metaworld_starter": 0, "libero_starter": 0 if PINNED else 1}
 @pytest.mark.parametrize("name", builtin_names())
 def test_every_shipped_state_has_its_hash(name):
     """Without it no handoff can be known to be the recorded one, bit for bit."""
-    found = load_scenarios(name)
+    found = load(name)
     assert len(found) > 0
     assert [s.id for s in found if s.fingerprint is None or not s.fingerprint.state_sha256] == []
     assert all(s.fingerprint.versions for s in found)
@@ -58,13 +61,13 @@ def test_every_shipped_state_has_its_hash(name):
 
 @pytest.mark.parametrize("name", builtin_names())
 def test_no_two_scenarios_are_one_moment(name):
-    moments = [s.sha256() for s in load_scenarios(name)]
+    moments = [s.sha256() for s in load(name)]
     assert len(set(moments)) == len(moments)
 
 
 @pytest.mark.parametrize(("name", "count"), FEW)
 def test_a_few_scenarios_by_replay_and_by_snapshot(name, count):
-    scenarios = sorted(load_scenarios(name), key=lambda s: len(s.prefix))
+    scenarios = sorted(load(name), key=lambda s: len(s.prefix))
     # Two of one task, so that one follows another in the same model, and the others of any.
     first = scenarios[0]
     twin = next(s for s in scenarios[1:] if s.task.name == first.task.name)
