@@ -20,6 +20,7 @@ from lerobot_roborecover.curation.screen.tables import (
     format_settled,
     histogram,
 )
+from lerobot_roborecover.curation.split import draw_unscreened
 from lerobot_roborecover.datasets import read_scenarios, write_scenarios
 from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.row import LoggedTrial
@@ -175,6 +176,11 @@ def test_where_a_curtailed_screening_stops():
     never = rows_with(scenario, dict.fromkeys(NAMES, 0), trials=1) | {"d": []}
     (found,) = count_outcomes([scenario], never, rule, "abc")
     assert (found.settled, found.soonest) == (False, 2)
+    # Of the unscreened sample, it has as many as it is validated with.
+    (drawn,) = screen([scenario], never, rule, "abc", {scenario.id})
+    assert (drawn.settled, drawn.soonest, drawn.unscreened) == (True, 0, True)
+    (fewer,) = count_outcomes([scenario], never | {"c": []}, rule, "abc", {scenario.id})
+    assert (fewer.settled, fewer.soonest) == (False, 1)
     lost = never | {"d": rows_with(scenario, dict.fromkeys(NAMES, 0), trials=4)["d"]}
     (found,) = screen([scenario], lost, rule, "abc")
     assert found.decision.reason == "too hard"
@@ -257,8 +263,10 @@ def test_policies_as_they_are_written():
             parse_policies(["a=org/x"], **bad)
 
 
-@pytest.mark.parametrize("curtail", [False, True])
-def test_hard_scenarios_go_to_the_first_policy_and_easy_ones_to_the_last(tmp_path, monkeypatch, curtail):
+@pytest.mark.parametrize(("curtail", "unscreened"), [(False, 0), (True, 0), (True, 2)])
+def test_hard_scenarios_go_to_the_first_policy_and_easy_ones_to_the_last(
+    tmp_path, monkeypatch, curtail, unscreened
+):
     """Of four the first two do the same every time: both fail in one scenario, both succeed in another."""
     hard, easy, between = scenarios = [fake_scenario(i) for i in range(3)]
     wins = {
@@ -283,11 +291,15 @@ def test_hard_scenarios_go_to_the_first_policy_and_easy_ones_to_the_last(tmp_pat
         dataset.ScreenRequest(
             dataset=str(tmp_path / "set"), out=tmp_path / "out", rule=ScreenRule(curtail=curtail),
             policies=parse_policies([f"{name}=x/{name}" for name in NAMES])[0], deterministic=["a", "b"],
+            unscreened=unscreened,
         )
     )  # fmt: skip
     assert len(read_scenarios(tmp_path / "out")) == 3
-    if curtail:
-        certain = {(s.id, name, 1) for s in scenarios for name in "ab"}
+    certain = {(s.id, name, 1) for s in scenarios for name in "ab"}
+    if unscreened:
+        assert draw_unscreened(scenarios, 2, 0) == {hard.id, easy.id}
+        assert set(tried) == certain | {(hard.id, "c", 1), (easy.id, "d", 1), (between.id, "d", 1)}
+    elif curtail:
         assert set(tried) == certain | {
             (hard.id, "c", 2), (easy.id, "d", 1), (easy.id, "d", 3), (between.id, "d", 1)
         }  # fmt: skip

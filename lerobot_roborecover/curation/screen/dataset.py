@@ -126,8 +126,6 @@ class Screening:
     """Empty where only a shard's trials were run."""
     rows: Mapping[str, Sequence[TrialRow]]
     """Rows by the policy's name."""
-    unscreened: Collection[str] = ()
-    """Ids of the sample that stays whatever the trials say."""
     repeats: Repeats | None = None
     """None where nothing was run twice."""
 
@@ -160,18 +158,18 @@ def screen_dataset(
         if request.retry:
             forget_trials(folder, request.retry)
     with TemporaryFolder("screen") as snapshots:
-        rows = _trials(request, scenarios, snapshots, progress)
+        rows = _trials(request, scenarios, sample, snapshots, progress)
     if request.shard:
         return Screening([], rows)
-    found = screen(scenarios, rows, request.rule, request.deterministic)
+    found = screen(scenarios, rows, request.rule, request.deterministic, sample)
     repeats = _repeats(request, scenarios, rows, progress) if request.repeat else None
     source = Path(request.dataset).expanduser()
-    decisions = [_decision(s, sample) for s in found]
+    decisions = [_decision(s) for s in found]
     write_stage(
         request.out,
         source if source.is_dir() else None,
         [
-            _screened(s, request.run_seed, sample)
+            _screened(s, request.run_seed)
             for s, decision in zip(found, decisions, strict=True)
             if decision.verdict == "kept"
         ],
@@ -179,7 +177,7 @@ def screen_dataset(
         (SCREENING_FILE, _record(found, request, rows, sample, repeats)),
         scenarios.manifest,
     )
-    return Screening(found, rows, sample, repeats)
+    return Screening(found, rows, repeats)
 
 
 def _repeats(
@@ -206,6 +204,7 @@ def _repeats(
 def _trials(
     request: ScreenRequest,
     scenarios: ScenarioSet,
+    sample: Collection[str],
     snapshots: Path,
     progress: Callable[[str, int, int], None],
 ) -> dict[str, list[TrialRow]]:
@@ -236,7 +235,8 @@ def _trials(
 
     def undecided() -> list[Screened]:
         so_far = {name: list(of.values()) for name, of in rows.items()}
-        return [s for s in count_outcomes(scenarios, so_far, rule, request.deterministic) if not s.settled]
+        counted = count_outcomes(scenarios, so_far, rule, request.deterministic, sample)
+        return [s for s in counted if not s.settled]
 
     def lacking() -> list[Screened]:
         return [s for s in undecided() if s.successes < rule.bounds(len(rows))[0]]
@@ -269,16 +269,17 @@ def describe(request: ScreenRequest, made: Screening) -> str:
         return f"part {request.shard}: trials in {request.trials}; join with --trials-from {request.trials}"
     rule, policies = request.rule, len(request.policies)
     low, high = rule.check(policies)
-    kept = sum(s.decision.verdict == "kept" and s.scenario.id not in made.unscreened for s in made.found)
+    found = [s for s in made.found if not s.unscreened]
+    kept = sum(s.decision.verdict == "kept" for s in found)
     head = (
-        f"{kept} of {pluralize(len(made.found), 'scenario')} in {request.out}: {low} to {high} successes of "
+        f"{kept} of {pluralize(len(found), 'scenario')} in {request.out}: {low} to {high} successes of "
         f"{policies * rule.trials} ({pluralize(policies, 'policy')} x {pluralize(rule.trials, 'trial')})"
     )
-    if made.unscreened:
-        head += f"; beside them {pluralize(len(made.unscreened), 'scenario')} drawn at random, unscreened"
+    if unscreened := len(made.found) - len(found):
+        head += f"; beside them {pluralize(unscreened, 'scenario')} drawn at random, unscreened"
     tables = (
-        format_policies(made.found),
-        format_settled(made.found) if rule.curtail else format_histogram(made.found, rule),
+        format_policies(found),
+        format_settled(found) if rule.curtail else format_histogram(found, rule),
         attrition_table(count_stages(read_decisions(request.out))),
     )
     repeats = () if made.repeats is None else (str(made.repeats),)
@@ -295,15 +296,15 @@ def validate_next(out: Path, trials: Path) -> list[str]:
     return [*argv, "--out", "VALIDATED"]
 
 
-def _decision(found: Screened, sample: Collection[str]) -> Decision:
-    if found.scenario.id not in sample:
+def _decision(found: Screened) -> Decision:
+    if not found.unscreened:
         return found.decision
     return replace(found.decision, verdict="kept", reason="", by="drawn at random before screening")
 
 
-def _screened(found: Screened, run_seed: int, sample: Collection[str]) -> Scenario:
+def _screened(found: Screened, run_seed: int) -> Scenario:
     scenario, note = found.scenario, provenance_of(found, run_seed)
-    split = UNSCREENED if scenario.id in sample else scenario.split
+    split = UNSCREENED if found.unscreened else scenario.split
     return replace(scenario, split=split, provenance={**scenario.provenance, "screening": note})
 
 
@@ -332,5 +333,9 @@ def _record(
             }
             for p in request.policies
         ],
-        **({} if request.rule.curtail else {"scenarios_by_successes": histogram(found)}),
+        **(
+            {}
+            if request.rule.curtail
+            else {"scenarios_by_successes": histogram([s for s in found if not s.unscreened])}
+        ),
     }

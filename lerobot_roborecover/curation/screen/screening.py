@@ -123,6 +123,8 @@ class Screened:
     counts: Mapping[str, PolicyCount]
     """Counts by the policy's name in this screening."""
     rule: ScreenRule
+    unscreened: bool = False
+    """Whether it was drawn before screening: it stays, and needs no more trials than it is validated with."""
 
     @property
     def successes(self) -> int:
@@ -146,13 +148,15 @@ class Screened:
     def settled(self) -> bool:
         """Whether trials that have not been run could not change the verdict, and there are enough of them to
         validate with."""
-        return self.complete or (self._run >= CURTAILED_LEAST and self._settled_by(0, 0))
+        return self.complete or (self._run >= CURTAILED_LEAST and (self.unscreened or self._settled_by(0, 0)))
 
     @property
     def soonest(self) -> int:
         """How many more trials, counting once each, can settle the verdict at best; 0 where it is settled."""
         left = self.planned - self.trials
         least = 0 if self.settled else max(1, CURTAILED_LEAST - self._run)
+        if self.unscreened:
+            return min(least, left)
         for more in range(least, left):
             if any(self._settled_by(successes, more) for successes in range(more + 1)):
                 return more
@@ -205,6 +209,7 @@ def screen(
     rows: Mapping[str, Sequence[TrialRow]],
     rule: ScreenRule,
     deterministic: Collection[str] = (),
+    unscreened: Collection[str] = (),
 ) -> list[Screened]:
     """Judges every scenario.
 
@@ -214,6 +219,7 @@ def screen(
             number of trials are left out. Their order does not matter.
         rule: who stays.
         deterministic: names of policies that do the same in every trial: one of each scenario counts as all.
+        unscreened: ids of the sample that was drawn before screening.
 
     Returns:
         One result a scenario, in their order.
@@ -222,7 +228,7 @@ def screen(
         ScenarioError: a scenario lacks a trial that its verdict needs, or two trials of a deterministic
             policy differ.
     """
-    found = count_outcomes(scenarios, rows, rule, deterministic)
+    found = count_outcomes(scenarios, rows, rule, deterministic, unscreened)
     for one in found:
         if one.complete or (rule.curtail and one.settled):
             continue
@@ -241,6 +247,7 @@ def count_outcomes(
     rows: Mapping[str, Sequence[TrialRow]],
     rule: ScreenRule,
     deterministic: Collection[str] = (),
+    unscreened: Collection[str] = (),
 ) -> list[Screened]:
     """Counts the trials that there are, whether or not they suffice; arguments are those of `screen`.
 
@@ -263,7 +270,7 @@ def count_outcomes(
                 check_repeats(name, found)
                 found, each_counts = found[:1], rule.trials
             counts[name] = _count(found, each_counts)
-        result.append(Screened(scenario, counts, rule))
+        result.append(Screened(scenario, counts, rule, scenario.id in unscreened))
     return result
 
 
