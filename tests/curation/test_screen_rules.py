@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -305,3 +306,28 @@ def test_hard_scenarios_go_to_the_first_policy_and_easy_ones_to_the_last(
         }  # fmt: skip
     else:
         assert set(tried) == {(s.id, n, 1 if n in "ab" else 5) for s in scenarios for n in NAMES}
+
+
+def test_handoffs_are_kept_until_the_trials_are_whole(tmp_path, monkeypatch):
+    scenario = fake_scenario(0)
+    write_scenarios(tmp_path / "set", [scenario])
+    request = dataset.ScreenRequest(
+        dataset=str(tmp_path / "set"), out=tmp_path / "out", policies=parse_policies(["a=x/a"])[0]
+    )
+    kept: list[Path] = []
+
+    def run_policy(policy, *_, snapshots, **__):
+        snapshots.mkdir(parents=True, exist_ok=True)
+        kept[:] = snapshots.iterdir()
+        if not kept:
+            (snapshots / "1.snapshot").write_bytes(b"")
+            raise KeyboardInterrupt
+        rows = rows_with(scenario, dict.fromkeys(NAMES, 3))["a"]
+        return [LoggedTrial(row, np.zeros((row.steps, 7))) for row in rows]
+
+    monkeypatch.setattr(dataset, "run_policy", run_policy)
+    with pytest.raises(KeyboardInterrupt):
+        dataset.screen_dataset(request)
+    dataset.screen_dataset(request)
+    assert [path.name for path in kept] == ["1.snapshot"]
+    assert not kept[0].parent.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,11 +38,12 @@ from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.atomic_io import check_new
 from lerobot_roborecover.utils.options import internal, option
-from lerobot_roborecover.utils.temporary import TemporaryFolder
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 
 SCREENING_FILE = "screening.json"
+SNAPSHOTS_FOLDER = ".snapshots"
+"""In the trials' folder, until the screening has come to its end: handoffs that need no replay again."""
 
 
 def _outcomes(text: str) -> tuple[str, ...]:
@@ -157,8 +159,9 @@ def screen_dataset(
                 take_trials(other / policy.name, folder)
         if request.retry:
             forget_trials(folder, request.retry)
-    with TemporaryFolder("screen") as snapshots:
-        rows = _trials(request, scenarios, sample, snapshots, progress)
+    snapshots = request.trials.resolve() / SNAPSHOTS_FOLDER
+    rows = _trials(request, scenarios, sample, snapshots, progress)
+    shutil.rmtree(snapshots, ignore_errors=True)
     if request.shard:
         return Screening([], rows)
     found = screen(scenarios, rows, request.rule, request.deterministic, sample)
