@@ -24,6 +24,7 @@ import numpy as np
 
 from lerobot_roborecover.curation.funnel import StageCounts
 from lerobot_roborecover.curation.policy_trials import check_repeats
+from lerobot_roborecover.curation.split import MEASURED
 from lerobot_roborecover.datasets.rendered_steps import RenderedSteps, RenderJob, replayed
 from lerobot_roborecover.datasets.trajectory_write import Trajectory, write_trajectories
 from lerobot_roborecover.logs.row import LoggedTrial, TrialRow
@@ -149,8 +150,8 @@ def choose_candidates(
     found: list[DonorCandidate] = []
     for sha, scenario in by_hash.items():
         rates = {policy: float(np.mean(done)) for policy, done in results[sha].items()}
-        if scenario.split == "test":
-            dropped["of the test split, which must not train anything"] += 1
+        if scenario.split in MEASURED:
+            dropped[f"of the {scenario.split} split, which must not train anything"] += 1
         elif base not in rates:
             dropped["without a trial of the base"] += 1
         elif rates[base] >= options.base_below:

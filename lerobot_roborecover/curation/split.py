@@ -33,6 +33,8 @@ from lerobot_roborecover.utils.options import internal, option
 APART = ("trajectory", "record", "instruction", "start")
 UNSCREENED = "unscreened"
 """Split of the scenarios that stay whatever screening policies do with them."""
+MEASURED = ("test", UNSCREENED)
+"""Splits that policies are measured on: nothing is trained on them."""
 
 
 def _apart(text: str) -> tuple[str, ...] | None:

@@ -81,7 +81,7 @@ def reasons(funnel: list[StageCounts]) -> dict[str, int]:
 def test_candidates_are_the_papers():
     """Base below 40 %, an alternative above 60 %: both strictly, invalid trials as failures."""
     a, b, c, d, e, f = scenarios()
-    f = replace(f, split="test")
+    f, g = replace(f, split="test"), replace(fake_scenario(6), split="unscreened")
     rows = [
         *rows_of(a, BASE, 1), *rows_of(a, GOOD, 4), *rows_of(a, FAIR, 3),  # 60 % is not above
         *rows_of(b, BASE, 2), *rows_of(b, GOOD, 5),  # 40 % is not below
@@ -89,17 +89,18 @@ def test_candidates_are_the_papers():
         *rows_of(d, BASE, 0), *rows_of(d, GOOD, 3),
         *rows_of(d, FAIR, 3), row(d, FAIR, 5, False, outcome="sim_error"),
         *rows_of(e, GOOD, 5),
-        *rows_of(f, BASE, 0), *rows_of(f, GOOD, 5),
+        *rows_of(f, BASE, 0), *rows_of(f, GOOD, 5), *rows_of(g, BASE, 0), *rows_of(g, GOOD, 5),
         *[replace(r, start="initial") for r in rows_of(d, GOOD, 5)],
     ]  # fmt: skip
-    funnel = begun("scenarios", 6)
-    found = choose_candidates([a, b, c, d, e, f], rows, BASE, DonorOptions(), funnel)
+    funnel = begun("scenarios", 7)
+    found = choose_candidates([a, b, c, d, e, f, g], rows, BASE, DonorOptions(), funnel)
     assert {(x.scenario.id, x.policy) for x in found} == {(a.id, GOOD), (c.id, GOOD), (c.id, FAIR)}
     assert reasons(funnel) == {
         "recovered by the base in 40% or more": 1,
         "recovered by no alternative in more than 60%": 1,
         "without a trial of the base": 1,
         "of the test split, which must not train anything": 1,
+        "of the unscreened split, which must not train anything": 1,
     }
     assert funnel[-1].kept == 3
     with pytest.raises(ScenarioError, match=r"no trial .* is by 'nobody'"):

@@ -12,6 +12,7 @@ import numpy as np
 
 from lerobot_roborecover.analysis.stats.fork_gain import MATCHED, note_of
 from lerobot_roborecover.curation.continuations import from_rollouts
+from lerobot_roborecover.curation.split import MEASURED
 from lerobot_roborecover.datasets.trajectories import TrajectorySet
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, TrialRow, read_actions
 from lerobot_roborecover.logs.trial_log import read_trial_log
@@ -165,12 +166,12 @@ def lines_of_dataset(
     return found
 
 
-def without_test(lines: Iterable[TrainingLine], dropped: Counter) -> list[TrainingLine]:
-    """Returns the lines outside the test split that have at least one step."""
+def may_train(lines: Iterable[TrainingLine], dropped: Counter) -> list[TrainingLine]:
+    """Returns the lines that have a step and whose scenarios may train."""
     found = []
     for line in lines:
-        if line.scenario.split == "test":
-            dropped["of the test split, which must not train anything"] += 1
+        if (split := line.scenario.split) in MEASURED:
+            dropped[f"of the {split} split, which must not train anything"] += 1
         elif line.steps < 1:
             dropped["without a step of its own"] += 1
         else:
