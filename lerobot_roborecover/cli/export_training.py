@@ -61,8 +61,8 @@ def run(options: TrainingDataOptions) -> int:
         TrainingLine,
         lines_of_dataset,
         lines_of_log,
-        may_train,
         policies_of,
+        trainable,
     )
     from lerobot_roborecover.datasets import load_scenarios
     from lerobot_roborecover.datasets.trajectories import read_trajectories
@@ -79,7 +79,7 @@ def run(options: TrainingDataOptions) -> int:
             lines += lines_of_dataset(read_trajectories(source), by_id, dropped)
         else:
             lines += lines_of_log(source, by_id, dropped, options.outcome)
-    lines = may_train(lines, dropped)
+    lines = trainable(lines, dropped)
     spec = env_config(scenarios.platform, options.scenarios, [f"--{o}" for o in options.env]).run_spec()
 
     def finish(folder: Path) -> None:

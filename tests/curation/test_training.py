@@ -26,7 +26,7 @@ from lerobot_roborecover.curation.training.lines import (
     line_of_trial,
     lines_of_dataset,
     lines_of_log,
-    may_train,
+    trainable,
 )
 from lerobot_roborecover.curation.training.returns import returns_to_go, values
 from lerobot_roborecover.datasets.lerobot_folder import local_repo_id
@@ -175,7 +175,7 @@ def test_every_frame_says_what_the_log_says(log, tmp_path):
 def test_scenarios_to_measure_on_train_nothing(split):
     test = replace(fake_scenario(0), split=split)
     dropped: Counter = Counter()
-    assert may_train([line(test, 3, True)], dropped) == []
+    assert trainable([line(test, 3, True)], dropped) == []
     assert dropped == {f"of the {split} split, which must not train anything": 1}
     with pytest.raises(ScenarioError, match="no episode is left"):
         export_training("out", [], simulator={}, workers=1, dropped=dropped)

@@ -272,7 +272,7 @@ def describe(request: ScreenRequest, made: Screening) -> str:
         return f"part {request.shard}: trials in {request.trials}; join with --trials-from {request.trials}"
     rule, policies = request.rule, len(request.policies)
     low, high = rule.check(policies)
-    found = [s for s in made.found if not s.unscreened]
+    found = _by_verdict(made.found)
     kept = sum(s.decision.verdict == "kept" for s in found)
     head = (
         f"{kept} of {pluralize(len(found), 'scenario')} in {request.out}: {low} to {high} successes of "
@@ -297,6 +297,11 @@ def validate_next(out: Path, trials: Path) -> list[str]:
     if any(s.id not in store for s in read_scenarios(out)):
         argv += ["--candidates", "CANDIDATES"]
     return [*argv, "--out", "VALIDATED"]
+
+
+def _by_verdict(found: Sequence[Screened]) -> list[Screened]:
+    """Those that stay or not by their trials."""
+    return [s for s in found if not s.unscreened]
 
 
 def _decision(found: Screened) -> Decision:
@@ -336,9 +341,5 @@ def _record(
             }
             for p in request.policies
         ],
-        **(
-            {}
-            if request.rule.curtail
-            else {"scenarios_by_successes": histogram([s for s in found if not s.unscreened])}
-        ),
+        **({} if request.rule.curtail else {"scenarios_by_successes": histogram(_by_verdict(found))}),
     }

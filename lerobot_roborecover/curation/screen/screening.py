@@ -146,8 +146,8 @@ class Screened:
 
     @property
     def settled(self) -> bool:
-        """Whether trials that have not been run could not change the verdict, and there are enough of them to
-        validate with."""
+        """Whether there are enough trials to validate with, and those that have not been run could not change
+        the verdict, if trials decide it."""
         return self.complete or (self._run >= CURTAILED_LEAST and (self.unscreened or self._settled_by(0, 0)))
 
     @property

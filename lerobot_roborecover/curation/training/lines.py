@@ -166,7 +166,7 @@ def lines_of_dataset(
     return found
 
 
-def may_train(lines: Iterable[TrainingLine], dropped: Counter) -> list[TrainingLine]:
+def trainable(lines: Iterable[TrainingLine], dropped: Counter) -> list[TrainingLine]:
     """Returns the lines that have a step and whose scenarios may train."""
     found = []
     for line in lines:
