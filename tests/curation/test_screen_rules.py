@@ -193,6 +193,28 @@ def test_where_a_curtailed_screening_stops():
     assert re.search(r"^d +n/a \(curtailed\)", table, re.M), table
 
 
+def test_what_no_trial_recovers_is_given_up():
+    scenario, rule = fake_scenario(0), ScreenRule(curtail=True, give_up=12)
+    never, ever = (dict.fromkeys(NAMES, wins) for wins in (0, 5))
+
+    def counted(trials: int, wins: int):
+        rows = rows_with(scenario, never, trials=1)
+        rows |= {"c": rows_with(scenario, never | {"c": wins}, trials=trials)["c"], "d": []}
+        return count_outcomes([scenario], rows, rule, "ab")[0]
+
+    assert [(counted(n, 0).settled, counted(n, 0).soonest) for n in range(4)] == [
+        (False, 2), (False, 1), (True, 0), (True, 0),
+    ]  # fmt: skip
+    assert counted(2, 0).decision.reason == "too hard"
+    assert not counted(2, 1).settled, "one success: it is tried on"
+    assert counted(2, 2).decision.verdict == "kept"
+    easy = rows_with(scenario, ever) | {"d": []}
+    assert not count_outcomes([scenario], easy, rule)[0].settled, "it is tried on for failures"
+    for bad in ({"give_up": 12}, {"give_up": -1, "curtail": True}):
+        with pytest.raises(ScenarioError, match=f"give up after {bad['give_up']} trials"):
+            ScreenRule(**bad)
+
+
 def test_a_policy_that_is_not_deterministic_is_found_out_where_it_has_more_trials():
     scenario = fake_scenario(0)
     rows = rows_with(scenario, {**dict.fromkeys(NAMES, 5), "c": 3})

@@ -41,7 +41,7 @@ JOURNAL_FILE = "stages.jsonl"
 _SCHEMA = 1
 _PACE = ("engine", "ray_address", "replicas", "num_workers", "limit_s", "watchdog", "retry_errors")
 """Options that decide how fast a result comes, not what it is."""
-_ADDED = {"early_stop", "min_distance", "min_per_split", "no_scarce", "repeat", "unscreened"}
+_ADDED = {"early_stop", "give_up_after", "min_distance", "min_per_split", "no_scarce", "repeat", "unscreened"}
 """Options that earlier versions did not have: where they are not given, what those built is up to date."""
 
 

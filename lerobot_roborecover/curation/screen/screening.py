@@ -5,7 +5,7 @@ all policies together lie within bounds. The paper: four policies, five trials, 
 is 10 % to 90 % ("Policy Difficulty Filtering"). Pure functions of trial rows.
 
 Trials that can no longer change a verdict need not be run (curtailed sampling): the verdicts are the same,
-only the counts are not complete.
+only the counts are not complete. `give_up` goes further: it drops what none of its first trials recovered.
 """
 
 from __future__ import annotations
@@ -52,12 +52,23 @@ class ScreenRule:
 
     A trial that is invalid can still change a verdict.
     """
+    give_up: int = option(0, name="give-up-after", metavar="N")
+    """With --early-stop, drop a scenario as too hard once N trials have failed and none has succeeded; 0
+    tries on while enough of them might still succeed.
+
+    One trial of a deterministic policy counts as all of its trials.
+    """
 
     def __post_init__(self):
         if self.trials < 1 or self.max_invalid < 0:
             raise ScenarioError(
                 f"{self.trials} trials, at most {self.max_invalid} invalid: there must be at least one "
                 "trial, and no fewer than 0 invalid ones"
+            )
+        if self.give_up < 0 or (self.give_up and not self.curtail):
+            raise ScenarioError(
+                f"give up after {self.give_up} trials: this is a number of trials, 1 or more, and needs "
+                "--early-stop"
             )
         self.bounds(1)
 
@@ -170,6 +181,8 @@ class Screened:
         low, high = self.rule.check(len(self.counts))
         won = self.successes + successes
         could = won + self.planned - self.trials - more
+        if not won and 0 < self.rule.give_up <= self.trials + more:
+            return True
         return could < low or won > high or (low <= won and could <= high)
 
     @property
