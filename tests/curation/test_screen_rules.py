@@ -210,6 +210,9 @@ def test_what_no_trial_recovers_is_given_up():
     assert counted(2, 2).decision.verdict == "kept"
     easy = rows_with(scenario, ever) | {"d": []}
     assert not count_outcomes([scenario], easy, rule)[0].settled, "it is tried on for failures"
+    hard = rows_with(scenario, never) | {"d": []}
+    at_most_two = ScreenRule(keep=("0", "2"), curtail=True, give_up=12)
+    assert not count_outcomes([scenario], hard, at_most_two)[0].settled, "it stays unless it is too easy"
     for bad in ({"give_up": 12}, {"give_up": -1, "curtail": True}):
         with pytest.raises(ScenarioError, match=f"give up after {bad['give_up']} trials"):
             ScreenRule(**bad)

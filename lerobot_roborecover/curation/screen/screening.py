@@ -181,9 +181,8 @@ class Screened:
         low, high = self.rule.check(len(self.counts))
         won = self.successes + successes
         could = won + self.planned - self.trials - more
-        if not won and 0 < self.rule.give_up <= self.trials + more:
-            return True
-        return could < low or won > high or (low <= won and could <= high)
+        given_up = won == 0 < low and 0 < self.rule.give_up <= self.trials + more
+        return given_up or could < low or won > high or (low <= won and could <= high)
 
     @property
     def invalid(self) -> Counter[str]:
