@@ -158,13 +158,12 @@ def replay_all(
             else:
                 todo.append(job)
         progress(len(found), len(scenarios))
+        todo.sort(key=lambda job: job.scenario.task.name)  # a process keeps the tasks that it has compiled
         ready = (replace(job, originals=originals.of(job.scenario)) for job in todo)
         platform = scenarios[0].platform if len(scenarios) else ""
-        # A process of its own for each, so that one which crashes or hangs is only its own end.
         with JobPool(
-            platform, workers=request.workers, limit_s=request.limit_s, fresh=True,
-            workplace=request.workplace,
-        ) as pool:  # fmt: skip
+            platform, workers=request.workers, limit_s=request.limit_s, workplace=request.workplace
+        ) as pool:
             for job, outcome in pool.outcomes(replay_job, ready, lambda job: (job,)):
                 report = _report_of(job, outcome)
                 result = report.replays

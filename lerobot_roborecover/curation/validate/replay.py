@@ -1,6 +1,7 @@
-"""Replays a scenario's drawn screening runs in a fresh process, and measures.
+"""Replays a scenario's drawn screening runs in a worker process, and measures.
 
-Imports neither LeRobot nor torch, so that a process starts in a second.
+Imports neither LeRobot nor torch, so that a process starts in a second. It keeps its simulators: compiling a
+task takes as long as replaying a scenario of it.
 """
 
 from __future__ import annotations
@@ -77,6 +78,11 @@ class ReplayReport:
     """A PNG; empty where there is nothing to see."""
 
 
+_MOST_KEPT = 3
+_kept: dict[str, Simulator] = {}
+"""Simulators of this process, by platform and options."""
+
+
 class _InvalidAction(Exception):
     """The simulator refused an action."""
 
@@ -91,27 +97,32 @@ class _ReplayTrace:
 
 def replay_job(job: ReplayJob) -> ReplayReport:
     """Replays everything; what the simulator does wrong is in the result."""
-    simulators: dict[str, Simulator] = {}
     try:
-        return _replay(job, simulators)
+        return _replay(job)
     except _InvalidAction as err:
-        return ReplayReport(Replays(error=str(err), error_kind=INVALID_ACTION))
+        failed = Replays(error=str(err), error_kind=INVALID_ACTION)
     except (SimulatorError, RuntimeError, ArithmeticError) as err:
-        return ReplayReport(Replays(error=f"{type(err).__name__}: {err}", error_kind=CRASH))
-    finally:
-        for simulator in simulators.values():
-            simulator.close()
+        failed = Replays(error=f"{type(err).__name__}: {err}", error_kind=CRASH)
+    while _kept:  # the next scenario gets a simulator that nothing has gone wrong in
+        _kept.popitem()[1].close()
+    return ReplayReport(failed)
 
 
-def _replay(job: ReplayJob, simulators: dict[str, Simulator]) -> ReplayReport:
+def _simulator(platform: str, options: Mapping[str, Any]) -> Simulator:
+    """One that this process has, or another in place of the oldest."""
+    name = json.dumps([platform, options], sort_keys=True, default=str)
+    if name not in _kept:
+        if len(_kept) == _MOST_KEPT:
+            _kept.pop(next(iter(_kept))).close()
+        _kept[name] = make_simulator(platform, **options)
+    return _kept[name]
+
+
+def _replay(job: ReplayJob) -> ReplayReport:
     scenario, originals = job.scenario, job.originals
 
     def simulator_of(options: Mapping[str, Any]) -> Simulator:
-        whole = {**job.options, **options}
-        name = json.dumps(whole, sort_keys=True, default=str)
-        if name not in simulators:
-            simulators[name] = make_simulator(scenario.platform, **whole)
-        return simulators[name]
+        return _simulator(scenario.platform, {**job.options, **options})
 
     first = _seen_from(scenario, originals, job.rollout)
     runs, seen = [], []
