@@ -1,14 +1,14 @@
-"""Functions run in worker processes, each with one simulator: replays, pictures, checks, conversions.
+"""Functions run in worker processes, each with its simulators: replays, pictures, checks, conversions.
 
 Making a simulator compiles its task (6 s of CPU on LIBERO), and what writes episodes imports LeRobot (11 to
-22 s), so a process and its simulator are kept from job to job, and from one use of the pool to the next;
-except where each job wants a process of its own (`fresh`), so that one which crashes or hangs is only its own
-end.
+22 s), so a process and its simulators are kept from job to job, and from one use of the pool to the next;
+except where jobs must share nothing (`fresh`). One which crashes or hangs is only its own end either way.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import pickle
 import sys
@@ -27,6 +27,8 @@ from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
 from lerobot_roborecover.workers.slots import SimulatorWorker, SlotPool
 
 SERVER = f"{__name__}:JobServer"
+_MOST_SIMULATORS = 3
+"""Of a worker process: jobs may ask for other options than the pool's."""
 
 
 @dataclass(frozen=True)
@@ -66,20 +68,24 @@ class JobServer:
     """Runs jobs in a worker process.
 
     Args:
-        config: platform and options of the simulator, which is made when a job first asks for it.
+        config: platform and options of the simulators, which are made when a job first asks for them.
     """
 
     def __init__(self, config: SlotConfig):
         global _server
         self._config = config
-        self._simulator: Simulator | None = None
+        self._simulators: dict[str, Simulator] = {}
         _server = self
 
-    @property
-    def simulator(self) -> Simulator:
-        if self._simulator is None:
-            self._simulator = make_simulator(self._config.platform, **self._config.options)
-        return self._simulator
+    def simulator(self, options: Mapping[str, Any] | None) -> Simulator:
+        """See `simulator_of_worker`."""
+        options = self._config.options if options is None else options
+        name, kept = json.dumps(options, sort_keys=True, default=str), self._simulators
+        if name not in kept:
+            if len(kept) == _MOST_SIMULATORS:
+                kept.pop(next(iter(kept))).close()
+            kept[name] = make_simulator(self._config.platform, **options)
+        return kept[name]
 
     def answer(self, command: str, argument: Job) -> Done | JobError:
         """Runs a job; the only command is `run`."""
@@ -93,17 +99,27 @@ class JobServer:
             return JobError(_picklable(err))
 
     def close(self) -> None:
-        if self._simulator is not None:
-            self._simulator.close()
+        while self._simulators:
+            self._simulators.popitem()[1].close()
 
 
 _server: JobServer | None = None
 
 
-def simulator_of_worker() -> Simulator:
-    """The simulator of this worker process, made when first asked for."""
+def simulator_of_worker(options: Mapping[str, Any] | None = None) -> Simulator:
+    """A simulator of this worker process, made when first asked for; the oldest of several makes room.
+
+    Args:
+        options: None takes the pool's.
+    """
     assert _server is not None, "not in a worker process"
-    return _server.simulator
+    return _server.simulator(options)
+
+
+def drop_simulators_of_worker() -> None:
+    """Closes them all: the next job gets one that nothing has gone wrong in."""
+    assert _server is not None, "not in a worker process"
+    _server.close()
 
 
 def _picklable(error: Exception) -> Exception:

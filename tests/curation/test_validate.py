@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import re
 import shutil
 import signal
@@ -36,7 +35,6 @@ from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions
 from lerobot_roborecover.platforms import make_simulator
 from lerobot_roborecover.replay.handoff import hand_off
 from lerobot_roborecover.scenario import Pose, ScenarioError
-from lerobot_roborecover.workers.jobs import JobPool
 from tests.support.factories import fake_scenario
 from tests.support.loop import push_policy
 from tests.support.processes import PATIENCE_S
@@ -184,30 +182,6 @@ def test_a_window_comes_out_as_it_does_in_the_whole_episode():
         original = np.stack([whole[i] for i in wanted])
         assert min(ssim(original, np.stack([part[i - clip.start] for i in wanted]))) > 0.999
         assert np.mean(ssim(original, np.stack([frames[i] for i in wanted]))) < 0.99
-
-
-def _work(job: str) -> str:
-    if job == "raises":
-        raise RuntimeError("broken")
-    if job == "exits":
-        os._exit(3)
-    if job == "hangs":
-        time.sleep(600)
-    return f"{job} {os.getpid()}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fresh", [True, False])
-def test_what_crashes_or_hangs_is_only_its_own_end(fresh):
-    with JobPool(fresh=fresh) as pool:
-        found = dict(pool.outcomes(_work, iter(["a", "raises", "exits", "b"]), lambda job: (job,)))
-    with JobPool(limit_s=0.5, fresh=fresh) as pool:
-        found |= pool.outcomes(_work, ["hangs"], lambda job: (job,))
-    assert found["raises"].words == "RuntimeError: broken"
-    assert "the worker died (exit status 3)" in found["exits"].message
-    assert "did not answer within 0.5 s" in found["hangs"].message
-    pids = {found[job].value.split()[1] for job in "ab"}
-    assert len(pids) == 2, "another process after one that died, or for each"
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from lerobot_roborecover.cli.main import main
 from lerobot_roborecover.curation.candidates import Candidate, read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, write_candidates
 from lerobot_roborecover.curation.rollout import record
-from lerobot_roborecover.curation.validate import replay
 from lerobot_roborecover.datasets import load_scenarios, read_scenarios, write_scenarios
 from lerobot_roborecover.datasets.trajectory_write import Trajectory
 from lerobot_roborecover.logs.row import ACTIONS_FOLDER, actions_digest, actions_path
@@ -95,16 +93,3 @@ def test_frames_of_the_video(tmp_path):
     assert all(r["after_mm"] == 0.0 for r in found.values())
     assert np.mean(found["c2"]["ssim"]["observation.image"]) < 0.99
     assert (tmp_path / "out.replays" / "sheets" / "c2.png").exists()
-
-
-def test_a_process_keeps_few_simulators(monkeypatch):
-    closed = []
-
-    def make(_platform: str, n: int) -> SimpleNamespace:
-        return SimpleNamespace(close=lambda: closed.append(n))
-
-    monkeypatch.setattr(replay, "_kept", {})
-    monkeypatch.setattr(replay, "make_simulator", make)
-    made = [replay._simulator("metaworld", {"n": n}) for n in (0, 1, 2, 0, 3)]
-    assert made[3] is made[0]
-    assert closed == [0]

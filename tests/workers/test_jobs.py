@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from lerobot_roborecover.platforms import SimulatorError
 from lerobot_roborecover.scenario import Reset, ScenarioError, Task
+from lerobot_roborecover.workers import jobs
 from lerobot_roborecover.workers.jobs import Done, JobError, JobPool, simulator_of_worker
-from lerobot_roborecover.workers.messages import SlotFailure
+from lerobot_roborecover.workers.messages import SlotConfig, SlotFailure
 from tests.support.processes import alive_after
 
 TASK = Task("fake", "toy", "push-left", "push", 60)
@@ -110,3 +112,20 @@ def test_an_abandoned_iterator_leaves_nothing_at_work():
 def test_a_function_that_no_worker_can_import_is_refused():
     with JobPool("fake") as pool, pytest.raises(ValueError, match="no function of a module"):
         pool.call(lambda: 1)
+
+
+def test_a_process_keeps_few_simulators(monkeypatch):
+    closed = []
+
+    def make(_platform: str, n: int) -> SimpleNamespace:
+        return SimpleNamespace(close=lambda: closed.append(n))
+
+    monkeypatch.setattr(jobs, "make_simulator", make)
+    monkeypatch.setattr(jobs, "_server", None)
+    jobs.JobServer(SlotConfig("fake", {"n": 0}, server=jobs.SERVER))
+    asked: list[dict[str, int] | None] = [None, {"n": 1}, {"n": 2}, {"n": 0}, {"n": 3}]
+    made = [simulator_of_worker(options) for options in asked]
+    assert made[3] is made[0]
+    assert closed == [0]
+    jobs.drop_simulators_of_worker()
+    assert sorted(closed) == [0, 1, 2, 3]

@@ -1,12 +1,10 @@
 """Replays a scenario's drawn screening runs in a worker process, and measures.
 
-Imports neither LeRobot nor torch, so that a process starts in a second. It keeps its simulators: compiling a
-task takes as long as replaying a scenario of it.
+Imports neither LeRobot nor torch, so that a process starts in a second.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
@@ -18,9 +16,10 @@ from lerobot_roborecover.curation.validate.frames import Originals, encoded, ssi
 from lerobot_roborecover.curation.validate.sheets import draw_sheet
 from lerobot_roborecover.curation.validate.validation import CRASH, INVALID_ACTION, Replays, RunReplay
 from lerobot_roborecover.datasets.frames import KEPT, camera_pictures
-from lerobot_roborecover.platforms import Simulator, SimulatorError, make_simulator
+from lerobot_roborecover.platforms import Simulator, SimulatorError
 from lerobot_roborecover.platforms.simulator import Steppable, follow
 from lerobot_roborecover.scenario import Pose, Scenario, ScenarioError
+from lerobot_roborecover.workers.jobs import drop_simulators_of_worker, simulator_of_worker
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,6 @@ class ReplayReport:
     """A PNG; empty where there is nothing to see."""
 
 
-_MOST_KEPT = 3
-_kept: dict[str, Simulator] = {}
-"""Simulators of this process, by platform and options."""
-
-
 class _InvalidAction(Exception):
     """The simulator refused an action."""
 
@@ -103,26 +97,15 @@ def replay_job(job: ReplayJob) -> ReplayReport:
         failed = Replays(error=str(err), error_kind=INVALID_ACTION)
     except (SimulatorError, RuntimeError, ArithmeticError) as err:
         failed = Replays(error=f"{type(err).__name__}: {err}", error_kind=CRASH)
-    while _kept:  # the next scenario gets a simulator that nothing has gone wrong in
-        _kept.popitem()[1].close()
+    drop_simulators_of_worker()
     return ReplayReport(failed)
-
-
-def _simulator(platform: str, options: Mapping[str, Any]) -> Simulator:
-    """One that this process has, or another in place of the oldest."""
-    name = json.dumps([platform, options], sort_keys=True, default=str)
-    if name not in _kept:
-        if len(_kept) == _MOST_KEPT:
-            _kept.pop(next(iter(_kept))).close()
-        _kept[name] = make_simulator(platform, **options)
-    return _kept[name]
 
 
 def _replay(job: ReplayJob) -> ReplayReport:
     scenario, originals = job.scenario, job.originals
 
     def simulator_of(options: Mapping[str, Any]) -> Simulator:
-        return _simulator(scenario.platform, {**job.options, **options})
+        return simulator_of_worker({**job.options, **options})
 
     first = _seen_from(scenario, originals, job.rollout)
     runs, seen = [], []
