@@ -247,6 +247,7 @@ def test_what_is_refused(screened, scenario_set, checkpoints, tmp_path, capsys, 
     twice = ["x=" + str(checkpoints[0]), "y=" + str(checkpoints[0])]
     assert "same checkpoint and options" in refused(*command(scenario_set, twice, out))
     assert "use --shard" in refused(*command(scenario_set, checkpoints, out, "--env", "shard=0/2"))
+    assert "--shard=2/2: must be k/n" in refused(*command(scenario_set, checkpoints, out, "--shard", "2/2"))
     assert "from 0 to 1" in refused(*command(scenario_set, checkpoints, out, "--repeat", "5"))
     assert "settles this itself" in refused(
         *command(scenario_set, checkpoints, out, "--env", "start=initial")

@@ -37,7 +37,7 @@ from lerobot_roborecover.errors import OptionError
 from lerobot_roborecover.logs.row import TrialRow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.utils.atomic_io import check_new
-from lerobot_roborecover.utils.options import internal, option
+from lerobot_roborecover.utils.options import internal, option, parse_shard
 from lerobot_roborecover.utils.text import next_command, pluralize
 from lerobot_roborecover.workers.backend import LOCAL, Backend
 
@@ -69,7 +69,7 @@ class ScreenRequest:
     trials_from: Sequence[Path] = option((), metavar="DIR")
     """A trials folder of another machine, to be taken over first; may be given again."""
     shard: str = option("", metavar="K/N")
-    """Run this part's trials only, and write no dataset."""
+    """Run this part's trials only, counted from 0, and write no dataset."""
     retry: Sequence[str] = option((), text="", metavar="OUTCOMES", parse=_outcomes)
     """Run invalid trials of these outcomes again, e.g. policy_error,timeout."""
     unscreened: int = option(0, metavar="N")
@@ -106,6 +106,8 @@ class ScreenRequest:
         """
         self.workplace.check()
         check_policies(self.policies)
+        if self.shard:
+            parse_shard(self.shard, "--shard")
         if not 0 <= self.repeat <= 1:
             raise OptionError(f"--repeat {self.repeat}: a share of the scenarios, from 0 to 1")
         unknown = set(self.deterministic) - {p.name for p in self.policies}
