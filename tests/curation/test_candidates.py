@@ -12,6 +12,7 @@ from lerobot_roborecover.curation.annotation.frames import Videos
 from lerobot_roborecover.curation.annotation.votes import Vote, VoteJournal, read_votes
 from lerobot_roborecover.curation.candidates import read_candidates
 from lerobot_roborecover.curation.candidates_write import Recording, merge_candidates, write_candidates
+from lerobot_roborecover.curation.collect.collection import Collected, describe
 from lerobot_roborecover.curation.funnel import (
     Decision,
     attrition_table,
@@ -85,6 +86,8 @@ def test_parts_become_one_and_say_what_they_said(parts, tmp_path):
         "collect        4     3          0        1",
         "                                         1  stuck",
     ]
+    told = describe(Collected(root, tuple(count_stages(read_decisions(root))), len(found)))
+    assert f"3 candidates in {root}; 1 beside them that a rule leaves out" in told
     # An exclusion is a decision like another: a person may take it back, and both stay on record.
     assert queued(found) == {"ep-0000", "ep-0002", "ep-0003"}
     assert record_decisions(root, [Decision("ep-0001", "collect", "kept", by="ann")]) == 1
