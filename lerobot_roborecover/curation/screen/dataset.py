@@ -69,7 +69,7 @@ class ScreenRequest:
     trials_from: Sequence[Path] = option((), metavar="DIR")
     """A trials folder of another machine, to be taken over first; may be given again."""
     shard: str = option("", metavar="K/N")
-    """Run this part's trials only, counted from 0, and write no dataset."""
+    """Run the trials of part K of N only, K from 0, and write no dataset."""
     retry: Sequence[str] = option((), text="", metavar="OUTCOMES", parse=_outcomes)
     """Run invalid trials of these outcomes again, e.g. policy_error,timeout."""
     unscreened: int = option(0, metavar="N")
