@@ -96,10 +96,8 @@ def describe(collected: Collected) -> str:
     lines = [attrition_table(collected.rows)] if collected.rows else []
     if collected.out is not None:
         excluded = collected.candidates - collected.rows[0].kept if collected.rows else 0
-        beside = f"; {excluded} beside them that a rule leaves out, for you to take back" if excluded else ""
-        lines.append(
-            f"\n{pluralize(collected.candidates - excluded, 'candidate')} in {collected.out}{beside}"
-        )
+        line = f"\n{pluralize(collected.candidates - excluded, 'candidate')} in {collected.out}"
+        lines.append(line + (f"; {excluded} beside them that a rule leaves out" if excluded else ""))
         lines.append(next_command(["curate", "annotate", str(collected.out), "--annotator", "NAME"]))
     else:
         lines.append("\nno rollout was kept, so no dataset was written")
