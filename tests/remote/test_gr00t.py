@@ -22,6 +22,7 @@ from lerobot_roborecover.policies.remote.gr00t import pack_call, read_npy, unpac
 from lerobot_roborecover.policies.remote.mapping import load_mapping, parse_mapping
 from lerobot_roborecover.policies.remote.translate import Translator
 from tests.support.gr00t_server import Gr00tServer, dumps, modalities
+from tests.support.processes import PATIENCE_S
 from tests.support.serve_loop import TRIALS, dataset, evaluate, remote  # noqa: F401 - fixtures
 
 pytestmark = pytest.mark.lerobot
@@ -80,7 +81,7 @@ def policy(url, mapping, width=2, **options):
     from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
     from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
-    settings = {"wait_s": 2, "reconnect_s": 0.3, "timeout_s": 20, "connections": 2, **options}
+    settings = {"wait_s": 2, "reconnect_s": 0.3, "timeout_s": PATIENCE_S, "connections": 2, **options}
     features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
     return RemotePolicy(RemoteConfig(url=url, mapping=mapping, output_features=features, **settings))
 

@@ -19,6 +19,7 @@ from lerobot_roborecover.policies.remote.mapping import load_mapping, parse_mapp
 from lerobot_roborecover.policies.remote.translate import Translator
 from lerobot_roborecover.policies.remote.vla_eval import pack_message, unpack_message
 from tests.support.policy_servers import vla_eval  # noqa: F401 - a fixture
+from tests.support.processes import PATIENCE_S
 from tests.support.serve_loop import (  # noqa: F401 - fixtures
     TRIALS,
     dataset,
@@ -52,7 +53,7 @@ def policy(url, mapping, width=2, **options):
     from lerobot_roborecover.policies.remote.configuration_remote import RemoteConfig
     from lerobot_roborecover.policies.remote.modeling_remote import RemotePolicy
 
-    settings = {"wait_s": 1, "reconnect_s": 0.3, "timeout_s": 20, **options}
+    settings = {"wait_s": 1, "reconnect_s": 0.3, "timeout_s": PATIENCE_S, **options}
     features = {"action": PolicyFeature(FeatureType.ACTION, (width,))}
     return RemotePolicy(RemoteConfig(url=url, mapping=mapping, output_features=features, **settings))
 

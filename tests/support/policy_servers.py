@@ -71,8 +71,8 @@ class OpenpiServer:
 
 
 def server_at(url, **options):
-    quick = {"timeout_s": 5.0, "wait_s": 0.3, "reconnect_s": 0.3, "connections": 2}
-    return RemoteServer(ServerOptions(url, **{**quick, **options}))
+    patient = {"timeout_s": PATIENCE_S, "wait_s": PATIENCE_S, "reconnect_s": 0.3, "connections": 2}
+    return RemoteServer(ServerOptions(url, **{**patient, **options}))
 
 
 def ask(url, *payloads, **options):
