@@ -191,7 +191,7 @@ def bad_server(kind):
     ],
 )
 def test_bad_answers(kind, error, words):
-    limit = {"timeout_s": 0.2} if kind == "hangs" else {}
+    limit = {"timeout_s": 0.2, "wait_s": PATIENCE_S} if kind == "hangs" else {}
     with OpenpiServer(bad_server(kind)).running() as url:
         (answer,) = ask(url, {"a": 1}, **limit, max_frame_bytes=2**20)
     assert isinstance(answer, error)
@@ -220,7 +220,7 @@ def test_no_server_and_another_server():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{free.getsockname()[1]}"
-    (answer,) = ask(url, {}, wait_s=0.3)
+    (answer,) = ask(url, {})
     assert isinstance(answer, ServerUnavailableError)
     assert f"no policy server at {url}" in str(answer)
     with OpenpiServer(lambda r, c: {}).running() as url:

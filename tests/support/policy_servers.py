@@ -71,8 +71,8 @@ class OpenpiServer:
 
 
 def server_at(url, **options):
-    patient = {"timeout_s": PATIENCE_S, "wait_s": PATIENCE_S, "reconnect_s": 0.3, "connections": 2}
-    return RemoteServer(ServerOptions(url, **{**patient, **options}))
+    settings = {"timeout_s": PATIENCE_S, "wait_s": 0.3, "reconnect_s": 0.3, "connections": 2, **options}
+    return RemoteServer(ServerOptions(url, **settings))
 
 
 def ask(url, *payloads, **options):
