@@ -61,7 +61,7 @@ _LIBERO = Path("policies/libero")
 _METAWORLD = Path("policies/study/metaworld_study/policies")
 SUBJECTS = {
     "libero": Subject(
-        "libero_recovery", _LIBERO / "act_few",
+        "libero_recovery_0", _LIBERO / "act_few",
         (_LIBERO / "act_recover_large", _LIBERO / "act_recover", _LIBERO / "act"), 90,
     ),
     "metaworld": Subject(

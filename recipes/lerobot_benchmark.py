@@ -26,7 +26,8 @@ from recipes.study.definition import IN_CHECKOUT, StudyDefinition, read_definiti
 from recipes.study.stored import write_stored_logs
 
 OUT = Path("examples/lerobot_benchmark")
-STUDIES = ("metaworld_recovery", "libero")
+SETS = ("metaworld_recovery", "libero_recovery")
+STUDIES = ("metaworld_recovery",)
 OWNER = "ORG"
 """Stands for the organisation that publishes the sets."""
 ENVHUB_SET = "metaworld_recovery"
@@ -35,8 +36,7 @@ ENVHUB_SET = "metaworld_recovery"
 
 def write_files(out: Path) -> None:
     """Writes what needs no statistics: `eval.yaml` of each set, and the EnvHub repository."""
-    for name in STUDIES:
-        dataset = read_definition(IN_CHECKOUT / name).dataset
+    for dataset in SETS:
         scenarios = list(load_scenarios(dataset))
         text = eval_yaml(dataset, scenarios[0].platform, len(scenarios), split_names(scenarios))
         atomic_write(out / "datasets" / dataset / EVAL_FILE, text)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lerobot_roborecover.evaluation.env_configs import RecoveryEnvConfig
     from lerobot_roborecover.evaluation.vector_env import ScenarioVectorEnv
 import re
+import shlex
 from pathlib import Path
 
 from lerobot_roborecover._version import __version__
@@ -132,6 +133,7 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
             "(roborecover dataset publish), and name it as org/name"
         )
     platform = platform_named(scenarios.platform)
+    requirements = _requirements(platform)
     offer = HubScenarios(platform.name, scenarios.source, scenarios.revision, split)
     values = {
         "platform": offer.platform,
@@ -146,14 +148,14 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
         title=repo_id.split("/")[-1],
         repo_id=repo_id,
         on_hub=bool(HUB_ID.fullmatch(offer.scenarios)),
-        install=platform.install_command,
+        install=shlex.join(["pip", "install", *requirements]),
         env_type=env_type_of(platform.env_name or platform.name),
         **values,
     )
     texts = {
         "env.py": render_text("env.py.j2", **values),
         "README.md": card,
-        "requirements.txt": _requirements(platform),
+        "requirements.txt": "".join(f"{line}\n" for line in requirements),
     }
     check_page(out, list(texts), lambda page: _MADE_HERE.search(page.read_bytes()) is not None)
     for name, text in texts.items():
@@ -161,11 +163,11 @@ def write_envhub(scenarios: ScenarioSet, out: Path, repo_id: str, split: str | N
     return [out / name for name in texts]
 
 
-def _requirements(platform: Platform) -> str:
+def _requirements(platform: Platform) -> list[str]:
     """This package, and the platform's own where another distribution brings it, at the versions in use."""
     extra = f"[{platform.extra}]" if platform.extra else ""
     ours = Platform.distribution
     if platform.distribution == ours:
-        return f"{ours}{extra}=={__version__}\n"
+        return [f"{ours}{extra}=={__version__}"]
     version = installed(platform.distribution)
-    return f"{ours}=={__version__}\n{platform.distribution}{extra}" + (f"=={version}\n" if version else "\n")
+    return [f"{ours}=={__version__}", f"{platform.distribution}{extra}" + (f"=={version}" if version else "")]

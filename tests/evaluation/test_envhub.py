@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import runpy
+import shlex
 
 import pytest
 
 from lerobot_roborecover._version import __version__
 from lerobot_roborecover.cli.main import main
-from lerobot_roborecover.platforms import platform_named
 from tests.support.factories import fake_dataset
 from tests.support.hub_client import REPO, commit_of
 from tests.support.hub_server import Repo
@@ -51,7 +51,8 @@ def test_lerobot_makes_the_environment_of_a_repository_on_the_hub(hub, client, t
     assert f"hf upload {ENV_REPO} {out}" in made.stdout
     text = (out / "env.py").read_text()
     assert commit in text, "the commit that was read, whatever main is later"
-    assert f"\n{platform_named('fake').install_command}\n" in (out / "README.md").read_text()
+    wanted = (out / "requirements.txt").read_text().split()
+    assert f"\npip install {shlex.join(wanted)}\n" in (out / "README.md").read_text()
     hub.repos[ENV_REPO] = repo = Repo()
     sha = repo.commit({path.name: path.read_bytes() for path in out.iterdir()})
     done = client.run(USE, f"{ENV_REPO}@{sha}", tmp_path / "log.jsonl", "")
@@ -70,8 +71,10 @@ def test_a_shipped_set_and_what_cannot_be_offered(tmp_path, capsys):
     make_env = runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env"]
     card = (tmp_path / "env" / "README.md").read_text()
     assert "--env.type=roborecover_metaworld --env.scenarios=metaworld_starter" in card
+    wanted = f"lerobot_env_roborecover=={__version__}"
+    assert f"\npip install {wanted}\n" in card, "no folder of this machine"
     assert callable(make_env)
-    assert (tmp_path / "env" / "requirements.txt").read_text() == f"lerobot_env_roborecover=={__version__}\n"
+    assert (tmp_path / "env" / "requirements.txt").read_text() == f"{wanted}\n"
     before, after = runpy.run_path(str(tmp_path / "env" / "env.py"))["make_env_processors"]()
     assert (before.steps, after.steps) == ([], []), "Meta-World needs none"
     before, _ = make_hub_processors(HubScenarios("libero", "libero_starter"))

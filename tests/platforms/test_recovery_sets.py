@@ -13,6 +13,8 @@ import lerobot_roborecover
 from lerobot_roborecover import load_scenarios
 from lerobot_roborecover.curation.split_dataset import check_splits
 from lerobot_roborecover.datasets import read_scenarios
+from lerobot_roborecover.datasets.schema import FOLDER, SCENARIOS_FILE
+from lerobot_roborecover.datasets.write import file_sha256
 from lerobot_roborecover.platforms import platform_named
 from lerobot_roborecover.platforms.libero import PLATFORM
 from lerobot_roborecover.platforms.libero.catalog import LIBERO_HORIZONS
@@ -37,23 +39,29 @@ class Wanted:
     versions: set[str]
     suites: dict[str, int] = field(default_factory=dict)
     """Tests of each."""
-
-    @property
-    def root(self) -> Path:
-        name = f"{self.platform}_recovery"
-        return Path(lerobot_roborecover.__file__).parent / "data" / name
+    unscreened: int = 0
 
 
+_LIBERO_VERSIONS = {"mujoco", "robosuite", "hf-libero", "libero_assets"}
 SETS = {
     "libero_recovery": Wanted(
+        "libero", 235, 706, 39, 11, 12_000_000,
+        {"act_recover", "tdmpc_recover", "diffusion_recover", "diffusion_few"},
+        _LIBERO_VERSIONS, dict.fromkeys(LIBERO_HORIZONS, 40), 201,
+    ),
+    "libero_recovery_0": Wanted(
         "libero", 200, 800, 34, 9, 12_000_000, {"act", "act_clean", "act_recover", "act_recover_large"},
-        {"mujoco", "robosuite", "hf-libero", "libero_assets"}, dict.fromkeys(LIBERO_HORIZONS, 40),
+        _LIBERO_VERSIONS, dict.fromkeys(LIBERO_HORIZONS, 40),
     ),
     "metaworld_recovery": Wanted(
         "metaworld", 300, 600, 15, 9, 6_000_000, {"act_shaken", "act_few", "act_clean", "tdmpc", "diffusion"},
         {"mujoco", "metaworld"},
     ),
 }  # fmt: skip
+
+
+FROZEN = "4362833200d0aee6b181718a502191a28748c3edeb609d4e8a8a1e5735d81614"
+"""SHA-256 of the scenarios of `libero_recovery` 1.0. Another choice gets another name."""
 
 
 @pytest.fixture(scope="module", params=SETS)
@@ -67,14 +75,21 @@ def wanted(name) -> Wanted:
 
 
 @pytest.fixture(scope="module")
-def scenarios(wanted) -> list[Scenario]:
-    return read_scenarios(wanted.root)
+def root(name) -> Path:
+    return Path(lerobot_roborecover.__file__).parent / "data" / name
+
+
+@pytest.fixture(scope="module")
+def scenarios(root) -> list[Scenario]:
+    return read_scenarios(root)
 
 
 def test_the_test_split_can_rank(scenarios, wanted):
     tests = [s for s in scenarios if s.split == "test"]
-    assert len(tests) >= wanted.tests
-    assert len(scenarios) - len(tests) >= wanted.training
+    splits = Counter(s.split for s in scenarios)
+    assert splits["test"] >= wanted.tests
+    assert splits["train"] >= wanted.training
+    assert splits["unscreened"] >= wanted.unscreened
     suites = Counter(s.task.suite for s in tests)
     assert all(suites[suite] >= least for suite, least in wanted.suites.items())
     cells = Counter(s.cell for s in tests)
@@ -83,14 +98,14 @@ def test_the_test_split_can_rank(scenarios, wanted):
     assert len({s.task.name for s in tests}) >= wanted.tasks
 
 
-def test_nothing_leaks_from_training_into_tests(wanted):
-    report = check_splits(wanted.root, ("trajectory", "record", "start"))
-    assert set(report.counts) == {"train", "test"}
+def test_nothing_leaks_from_training_into_tests(root, wanted):
+    report = check_splits(root, ("trajectory", "record", "start"))
+    assert set(report.counts) == {"train", "test"} | ({"unscreened"} if wanted.unscreened else set())
     assert not report.leaks
 
 
-def test_it_is_small_enough_for_the_package(wanted):
-    assert sum(f.stat().st_size for f in wanted.root.rglob("*") if f.is_file()) < wanted.size
+def test_it_is_small_enough_for_the_package(root, wanted):
+    assert sum(f.stat().st_size for f in root.rglob("*") if f.is_file()) < wanted.size
 
 
 def test_each_scenario_says_how_it_came_about(scenarios, wanted):
@@ -103,6 +118,11 @@ def test_each_scenario_says_how_it_came_about(scenarios, wanted):
 
 
 @pytest.mark.parametrize("name", ["libero_recovery"], indirect=True)
+def test_libero_s_are_frozen(root):
+    assert file_sha256(root / FOLDER / SCENARIOS_FILE) == FROZEN
+
+
+@pytest.mark.parametrize("name", ["libero_recovery", "libero_recovery_0"], indirect=True)
 def test_libero_s_settle_as_libero_does(scenarios):
     for s in scenarios:
         assert s.task.horizon == LIBERO_HORIZONS[s.task.suite]
@@ -112,4 +132,4 @@ def test_libero_s_settle_as_libero_does(scenarios):
 @pytest.mark.slow
 def test_libero_s_is_what_is_evaluated_by_default():
     assert PLATFORM.evaluated("", None) == ("libero_recovery", "test")
-    assert len(load_scenarios("libero_recovery", split="test")) == 200
+    assert len(load_scenarios("libero_recovery", split="test")) == 235

@@ -40,7 +40,7 @@ WHOLE = [
     pytest.param("pusht_starter", ""),
     *(
         pytest.param(name, f"suite={s}", marks=pytest.mark.libero)
-        for name in ("libero_starter", "libero_recovery")
+        for name in ("libero_starter", "libero_recovery", "libero_recovery_0")
         for s in LIBERO_SUITES
     ),
 ]

@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 from scipy import stats
 
-from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate
+from lerobot_roborecover.analysis.stats.intervals import LEVEL, Estimate, independent_difference
 
 MARGIN = 0.10
 """A loss that a comparison has to be able to show before it counts as agreement."""
@@ -45,9 +45,6 @@ class ScoreAgreement:
 def agreement(measured: Estimate, published: Estimate | None, margin: float = MARGIN) -> ScoreAgreement:
     """Compares two rates from different trials by the interval of their difference.
 
-    The interval is put together from the two rates' own (MOVER: Newcombe 1998, method 10; Donner and Zou
-    2012), whatever these were made by.
-
     Args:
         measured: here; undefined where no trial was valid.
         published: by others; None where there is nothing.
@@ -58,13 +55,8 @@ def agreement(measured: Estimate, published: Estimate | None, margin: float = MA
         return ScoreAgreement(measured, published or nothing, nothing, AgreementVerdict.UNMEASURED)
     if published is None or math.isnan(measured.low):
         return ScoreAgreement(measured, published or nothing, nothing, AgreementVerdict.UNPUBLISHED)
-    low, high = (_or(bound, published.value) for bound in (published.low, published.high))
-    value = measured.value - published.value
-    difference = Estimate(
-        value,
-        value - math.hypot(measured.value - measured.low, high - published.value),
-        value + math.hypot(measured.high - measured.value, published.value - low),
-    )
+    bounds = (_or(bound, published.value) for bound in (published.low, published.high))
+    difference = independent_difference(measured, Estimate(published.value, *bounds))
     if difference.high < 0:
         standing = AgreementVerdict.LOWER
     elif difference.low > 0:
