@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -120,6 +120,19 @@ def test_each_scenario_says_how_it_came_about(scenarios, wanted):
 @pytest.mark.parametrize("name", ["libero_recovery"], indirect=True)
 def test_libero_s_are_frozen(root):
     assert file_sha256(root / FOLDER / SCENARIOS_FILE) == FROZEN
+
+
+@pytest.mark.parametrize("name", ["libero_recovery"], indirect=True)
+def test_no_two_recovery_points_of_a_task_are_within_5_mm(scenarios):
+    """In at least one body; of all splits."""
+    points = defaultdict(list)
+    for s in scenarios:
+        bodies = s.fingerprint.bodies
+        points[s.task.suite, s.task.name].append([bodies[name].position_m for name in sorted(bodies)])
+    for found in points.values():
+        a, b = np.triu_indices(len(found), 1)
+        positions = np.array(found)
+        assert np.linalg.norm(positions[a] - positions[b], axis=-1).max(axis=-1).min() > 0.005
 
 
 @pytest.mark.parametrize("name", ["libero_recovery", "libero_recovery_0"], indirect=True)
