@@ -102,7 +102,8 @@ class Study:
     ) -> Path:
         """Log of a policy's trials; of the tests those that are a learned policy's own failures."""
         subject = self.subject
-        options = [f"--policy.path={policy}"]
+        # A recovery point is replayed once, whoever goes on from it; each restored state is checked.
+        options = [f"--policy.path={policy}", f"--env.snapshot_dir={self.out / 'snapshots'}"]
         if split == "test":
             options.append(f"--env.select=source={Source.NATURAL.value}")
         return evaluate(

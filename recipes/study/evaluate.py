@@ -39,6 +39,8 @@ RUN_FILE = "run.yaml"
 ARM_GB = 1.0
 """Memory reckoned for an arm beside its simulator: LeRobot, torch and a small policy."""
 _SHOWN_LINES = 12
+_NOT_OF_TRIALS = ("scenarios", "split", "select", "trial_log", "snapshot_dir")
+"""Options of the env that change none of a trial's own outcome."""
 
 
 def scenario_ids(study: StudyDefinition, every: int) -> list[str]:
@@ -165,8 +167,9 @@ def run_arm(
 
 def run_of(arm: StudyArm, study: StudyDefinition, ids: Sequence[str]) -> Arm:
     """An arm's run in a process of its own, which rounds as the study says; its output goes into a file."""
-    # With other slots the trials are the same: what has finished is not run again for them.
-    same = replace(arm.run, runner={**arm.run.runner, "slots": 0}).config()
+    # With other slots or snapshots the trials are the same: what has finished is not run again for them.
+    env = {k: v for k, v in arm.run.env.items() if k != "snapshot_dir"}
+    same = replace(arm.run, env=env, runner={**arm.run.runner, "slots": 0}).config()
     return Arm(
         arm.label, arm.log, ["eval", f"--config_path={arm.out / RUN_FILE}"], _identity(arm),
         decides=[same, list(ids)], environment=study.environment, output=arm.out / "output.log",
@@ -176,7 +179,7 @@ def run_of(arm: StudyArm, study: StudyDefinition, ids: Sequence[str]) -> Arm:
 def _identity(arm: StudyArm) -> dict[str, Any]:
     """What all rows of an arm's log share: its policy's files and options, the env's options, and so on."""
     run = arm.run
-    env = {k: v for k, v in run.env.items() if k not in ("scenarios", "split", "select", "trial_log")}
+    env = {k: v for k, v in run.env.items() if k not in _NOT_OF_TRIALS}
     stored = {"cross_cpu_deterministic": "portable"}  # names in the identities of earlier runs
     runner = {stored.get(k, k): v for k, v in run.runner.items() if k != "slots"}
     return identity_of_run(

@@ -63,6 +63,8 @@ def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
     assert [a.trials for a in found] == [1, 1, 2, 2, 1]
     assert all(a.run.runner["max_batch"] == 1 for a in found)
     assert all("--runner.cross_cpu_deterministic=true" in a.run.command_line() for a in found)
+    # They share recovery points, as far as they are replayed already.
+    assert {a.run.env["snapshot_dir"] for a in found} == {tmp_path / "out" / "snapshots"}
     assert f"--policy.base.path={study / 'policies' / 'act'}" in found[-1].run.command_line()
 
 
@@ -79,6 +81,7 @@ def test_a_whole_study_on_the_fake_simulator(study, tmp_path, capsys):
     assert "act/initial: 8 trials" in said
     outcomes = read_outcomes(out / "outcomes.csv")
     assert len(outcomes) == COUNT * (2 + 2)
+    assert len(list((out / "snapshots").glob("*.snapshot"))) == 2 * COUNT
 
     # Stored, and run again: elsewhere, with more simulators, on a part of the scenarios.
     write_outcomes(study / "outcomes.csv", outcomes)
