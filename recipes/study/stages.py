@@ -58,15 +58,16 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
     screening = [str(p.name) for p in chain.screen.policies]
     trials = out / "panel_trials" if shipped else out / "scenarios" / "screened.trials"
     scenarios = recipe.dataset if shipped else str(out / "scenarios" / "split")
+    settings = {**recipe.env, "snapshot_dir": str(out / "snapshots")}  # replayed once, whoever goes on
 
     def trials_of(path: str, count: int, folder: Path, *options: str) -> tuple[str, ...]:
         return _cli(
             "eval", "--env", f"roborecover_{recipe.platform}", f"--env.scenarios={scenarios}",
-            "--env.split=train", *(f"--env.{n}={value}" for n, value in recipe.env.items()),
+            "--env.split=train", *(f"--env.{n}={value}" for n, value in settings.items()),
             *options, f"--policy.path={path}", f"--eval.n_episodes={count}", f"--output_dir={folder}",
         )  # fmt: skip
 
-    env = [part for name, value in recipe.env.items() for part in ("--env", f"{name}={value}")]
+    env = [part for name, value in settings.items() for part in ("--env", f"{name}={value}")]
     logs = [str(trials / name / "trials.jsonl") for name in screening]
     base_trials = out / "base_trials"
     # A base policy that was not used for screening has no trials yet.
