@@ -5,7 +5,7 @@ Imports neither LeRobot nor torch, so that a process starts in a second.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
@@ -16,6 +16,9 @@ from lerobot_roborecover.platforms import Observation, Simulator, make_simulator
 from lerobot_roborecover.platforms.simulator import ShowsProgress, follow
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
+
+GROUPED_LOOKS = 512
+"""Observations of jobs that one process replays together, at most: all are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,57 @@ class RenderedSteps:
     """(k,) of the task before each of the steps; NaN where the simulator does not tell."""
 
 
-def render_steps(simulator: Simulator, job: RenderJob) -> RenderedSteps:
-    """Replays one trajectory to its end; renders only what is asked for."""
-    wanted = set(job.steps.tolist())
-    simulator.reset(job.scenario.task, job.scenario.reset)
-    seen, progress = [], []
+def render_steps(simulator: Simulator, jobs: Sequence[RenderJob]) -> list[RenderedSteps]:
+    """Replays trajectories to their ends; renders only what is asked for.
+
+    Args:
+        simulator: which.
+        jobs: with one scenario and as many steps of its prefix, which is replayed once where the simulator's
+            snapshots are exact.
+    """
+    scenario, length = jobs[0].scenario, jobs[0].prefix_steps
+    prefix = scenario.prefix[:length]
+    if len(jobs) > 1 and not (simulator.snapshot_is_exact and len(prefix)):
+        return [found for job in jobs for found in render_steps(simulator, [job])]
+    wanted = {step for job in jobs for step in job.steps.tolist()}
+    shared, before = {}, b""
+    simulator.reset(scenario.task, scenario.reset)
     # Each action in its own type: the prefix in float64, the others as the policy gave them.
-    for step in follow(simulator, chain(job.scenario.prefix[: job.prefix_steps], job.actions)):
-        if step in wanted:
-            seen.append(simulator.observe())
-            progress.append(simulator.progress() if isinstance(simulator, ShowsProgress) else np.nan)
-    return RenderedSteps(seen, simulator.succeeded(), np.array(progress, float))
+    for step in follow(simulator, prefix):
+        if step in wanted and step < len(prefix):
+            shared[step] = _look(simulator)
+        if step == len(prefix) - 1 and len(jobs) > 1:
+            before = simulator.snapshot()
+    found = []
+    for job in jobs:
+        if found:
+            simulator.restore(before)
+            simulator.step(prefix[-1])
+        asked = set(job.steps.tolist())
+        seen = {s: _look(simulator) for s in follow(simulator, job.actions, len(prefix)) if s in asked}
+        looks = [(shared | seen)[step] for step in job.steps.tolist()]
+        progress = np.array([p for _, p in looks], float)
+        found.append(RenderedSteps([o for o, _ in looks], simulator.succeeded(), progress))
+    return found
+
+
+def _look(simulator: Simulator) -> tuple[Observation, float]:
+    return simulator.observe(), simulator.progress() if isinstance(simulator, ShowsProgress) else np.nan
+
+
+def groups(jobs: Iterable[RenderJob]) -> Iterator[list[RenderJob]]:
+    """Jobs that follow each other and share what comes before their actions, as far as memory is to go."""
+    group: list[RenderJob] = []
+    looks = 0
+    for job in jobs:
+        same = group and group[0].scenario is job.scenario and group[0].prefix_steps == job.prefix_steps
+        if group and not (same and looks + len(job.steps) <= GROUPED_LOOKS):
+            yield group
+            group, looks = [], 0
+        group.append(job)
+        looks += len(job.steps)
+    if group:
+        yield group
 
 
 def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int) -> Iterator[RenderedSteps]:
@@ -68,13 +111,14 @@ def replayed(jobs: Sequence[RenderJob], options: Mapping[str, Any], workers: int
     if workers <= 1:
         simulator = make_simulator(platform, **options)
         try:
-            yield from (render_steps(simulator, job) for job in jobs)
+            for group in groups(jobs):
+                yield from render_steps(simulator, group)
         finally:
             simulator.close()
         return
     with JobPool(platform, options, workers) as pool:
-        yield from pool.map_ordered(_render_steps, jobs)
+        yield from chain.from_iterable(pool.map_ordered(_render_steps, list(groups(jobs)), tuple))
 
 
-def _render_steps(job: RenderJob) -> RenderedSteps:
-    return render_steps(simulator_of_worker(), job)
+def _render_steps(*group: RenderJob) -> list[RenderedSteps]:
+    return render_steps(simulator_of_worker(), group)
