@@ -74,7 +74,7 @@ def render_steps(simulator: Simulator, jobs: Sequence[RenderJob]) -> list[Render
             simulator.step(prefix[-1])
         asked = set(job.steps.tolist())
         seen = {s: _look(simulator) for s in follow(simulator, job.actions, len(prefix)) if s in asked}
-        looks = [(shared | seen)[step] for step in job.steps.tolist()]
+        looks = [look for step, look in sorted((shared | seen).items()) if step in asked]
         progress = np.array([p for _, p in looks], float)
         found.append(RenderedSteps([o for o, _ in looks], simulator.succeeded(), progress))
     return found
