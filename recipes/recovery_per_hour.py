@@ -102,7 +102,7 @@ class Study:
     ) -> Path:
         """Log of a policy's trials; of the tests those that are a learned policy's own failures."""
         subject = self.subject
-        # A recovery point is replayed once, whoever goes on from it; each restored state is checked.
+        # All runs share the snapshots of recovery points.
         options = [f"--policy.path={policy}", f"--env.snapshot_dir={self.out / 'snapshots'}"]
         if split == "test":
             options.append(f"--env.select=source={Source.NATURAL.value}")

@@ -14,6 +14,7 @@ import numpy as np
 
 from lerobot_roborecover.platforms import Observation, Simulator, make_simulator
 from lerobot_roborecover.platforms.simulator import ShowsProgress, follow
+from lerobot_roborecover.replay.handoff import SnapshotCache, replay_to
 from lerobot_roborecover.scenario import Scenario
 from lerobot_roborecover.workers.jobs import JobPool, simulator_of_worker
 
@@ -54,27 +55,22 @@ def render_steps(simulator: Simulator, jobs: Sequence[RenderJob]) -> list[Render
         jobs: with one scenario and as many steps of its prefix, which is replayed once where the simulator's
             snapshots are exact.
     """
-    scenario, length = jobs[0].scenario, jobs[0].prefix_steps
-    prefix = scenario.prefix[:length]
-    if len(jobs) > 1 and not (simulator.snapshot_is_exact and len(prefix)):
-        return [found for job in jobs for found in render_steps(simulator, [job])]
+    scenario, length = jobs[0].scenario, len(jobs[0].scenario.prefix[: jobs[0].prefix_steps])
+    cache = SnapshotCache() if len(jobs) > 1 else None
     wanted = {step for job in jobs for step in job.steps.tolist()}
-    shared, before = {}, b""
-    simulator.reset(scenario.task, scenario.reset)
-    # Each action in its own type: the prefix in float64, the others as the policy gave them.
-    for step in follow(simulator, prefix):
-        if step in wanted and step < len(prefix):
+    shared: dict[int, tuple[Observation, float]] = {}
+
+    def in_prefix(step: int) -> None:
+        if step in wanted:
             shared[step] = _look(simulator)
-        if step == len(prefix) - 1 and len(jobs) > 1:
-            before = simulator.snapshot()
+
     found = []
     for job in jobs:
-        if found:
-            simulator.restore(before)
-            simulator.step(prefix[-1])
         asked = set(job.steps.tolist())
-        seen = {s: _look(simulator) for s in follow(simulator, job.actions, len(prefix)) if s in asked}
-        looks = [look for step, look in sorted((shared | seen).items()) if step in asked]
+        replay_to(simulator, scenario.rollout, length, cache, in_prefix)
+        # Each action in its own type: the prefix in float64, these as the policy gave them.
+        own = {s: _look(simulator) for s in follow(simulator, job.actions, length) if s in asked}
+        looks = [look for step, look in sorted((shared | own).items()) if step in asked]
         progress = np.array([p for _, p in looks], float)
         found.append(RenderedSteps([o for o, _ in looks], simulator.succeeded(), progress))
     return found
@@ -85,7 +81,7 @@ def _look(simulator: Simulator) -> tuple[Observation, float]:
 
 
 def groups(jobs: Iterable[RenderJob]) -> Iterator[list[RenderJob]]:
-    """Jobs that follow each other and share what comes before their actions, as far as memory is to go."""
+    """Puts jobs that follow each other and have one prefix together, up to `GROUPED_LOOKS` observations."""
     group: list[RenderJob] = []
     looks = 0
     for job in jobs:

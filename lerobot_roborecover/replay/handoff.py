@@ -15,13 +15,13 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_roborecover.platforms.robot_fingerprint import NAME, compare_robots, is_robot_entry
-from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError, advance
+from lerobot_roborecover.platforms.simulator import Simulator, SimulatorError, advance, follow
 from lerobot_roborecover.scenario import (
     HANDOFF_TOLERANCE_M,
     Fingerprint,
@@ -196,7 +196,11 @@ def check_robot(simulator: Simulator, scenario: TrialStart) -> None:
 
 
 def replay_to(
-    simulator: Simulator, rollout: Rollout, step: int, cache: SnapshotCache | None = None
+    simulator: Simulator,
+    rollout: Rollout,
+    step: int,
+    cache: SnapshotCache | None = None,
+    on_state: Callable[[int], None] = lambda number: None,
 ) -> tuple[str, bool]:
     """Resets the task and replays the first `step` actions, or restores what that gave before.
 
@@ -205,6 +209,7 @@ def replay_to(
         rollout: what to replay.
         step: number of actions.
         cache: snapshots of earlier replays, used where the simulator's are exact, or the cache approximate.
+        on_state: called in each state before the last, with its number, where the actions are replayed.
 
     Returns:
         Hash of the simulator's state, and whether a snapshot stood in for the replay.
@@ -225,7 +230,9 @@ def replay_to(
             return state, True
         cache.reject(key)
         simulator.reset(rollout.task, rollout.reset)
-    advance(simulator, rollout.actions[: max(step - 1, 0)])
+    for number in follow(simulator, rollout.actions[: max(step - 1, 0)]):
+        if number < step:
+            on_state(number)
     snapshot = simulator.snapshot() if cache is not None and key not in cache.rejected else None
     if step:
         simulator.step(rollout.actions[step - 1])

@@ -88,7 +88,7 @@ def _arm(
         **({"select": f"id={'|'.join(ids)}"} if ids else {}),
         **{option: yaml.safe_load(text) for option, text in sorted(study.env.items())},
         "trial_log": folder / "trials.jsonl",
-        # A recovery point is replayed once, whoever goes on from it; each restored state is checked.
+        # All runs share the snapshots of recovery points.
         "snapshot_dir": out / "snapshots",
     }
     # One observation a batch: an inference then rounds alike, whichever other trials wait.

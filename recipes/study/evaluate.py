@@ -40,7 +40,7 @@ ARM_GB = 1.0
 """Memory reckoned for an arm beside its simulator: LeRobot, torch and a small policy."""
 _SHOWN_LINES = 12
 _NOT_OF_TRIALS = ("scenarios", "split", "select", "trial_log", "snapshot_dir")
-"""Options of the env that change none of a trial's own outcome."""
+"""Options of the env that do not decide how a trial ends."""
 
 
 def scenario_ids(study: StudyDefinition, every: int) -> list[str]:

@@ -58,7 +58,7 @@ def stages(out: Path, recipe: StudyRecipe, chain: ChainConfig, *, shipped: bool 
     screening = [str(p.name) for p in chain.screen.policies]
     trials = out / "panel_trials" if shipped else out / "scenarios" / "screened.trials"
     scenarios = recipe.dataset if shipped else str(out / "scenarios" / "split")
-    settings = {**recipe.env, "snapshot_dir": str(out / "snapshots")}  # replayed once, whoever goes on
+    settings = {**recipe.env, "snapshot_dir": str(out / "snapshots")}  # all runs share them
 
     def trials_of(path: str, count: int, folder: Path, *options: str) -> tuple[str, ...]:
         return _cli(

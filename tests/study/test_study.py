@@ -63,7 +63,6 @@ def test_every_policy_from_both_starts_then_the_interventions(study, tmp_path):
     assert [a.trials for a in found] == [1, 1, 2, 2, 1]
     assert all(a.run.runner["max_batch"] == 1 for a in found)
     assert all("--runner.cross_cpu_deterministic=true" in a.run.command_line() for a in found)
-    # They share recovery points, as far as they are replayed already.
     assert {a.run.env["snapshot_dir"] for a in found} == {tmp_path / "out" / "snapshots"}
     assert f"--policy.base.path={study / 'policies' / 'act'}" in found[-1].run.command_line()
 
@@ -225,10 +224,8 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
     assert all(path.is_dir() for path in policies.done)
     assert metrics.name == "monitor metrics"
     chain = chain_for(tmp_path, recipe)
-    recorded = {part.dataset for part in chain.collect.values() if part.dataset}
-    assert recorded == {str(tmp_path / name) for name in recipe.recordings}, (
-        "the chain takes what is recorded"
-    )
+    taken_by_chain = {part.dataset for part in chain.collect.values() if part.dataset}
+    assert taken_by_chain == {str(tmp_path / name) for name in recipe.recordings}
     # Its base was kept out of screening: it is run on the training scenarios before donors are sought.
     assert recipe.base not in {p.name for p in chain.screen.policies}
     names = [s.name for s in found]
