@@ -335,8 +335,8 @@ def test_what_ships_for_libero_fits_its_environment(mode):
     def make(**env):
         config = RoboRecoverInterventionConfig(
             base=MemberConfig(str(root / "libero" / "act_few")),
-            correction=MemberConfig(str(root / "study" / "libero_0" / "correction")),
-            monitor=MonitorConfig(str(root / "study" / "libero_0" / "monitor")),
+            correction=MemberConfig(str(root / "study" / "libero" / "correction")),
+            monitor=MonitorConfig(str(root / "study" / "libero" / "monitor")),
             mode=mode,
             device="cpu",
         )
