@@ -11,11 +11,12 @@ from recipes.study.definition import read_definition, shipped_study
 from recipes.study.evaluate import run_arm, scenario_ids
 from recipes.study.outcomes import outcomes_of, read_outcomes
 
-STUDIES = ("metaworld", "metaworld_recovery", "libero", "libero_0")
+STUDIES = ("metaworld", "metaworld_recovery", "libero", "libero_unscreened", "libero_0")
 SLICES = (
     pytest.param("metaworld", 32, marks=pytest.mark.metaworld),
     pytest.param("metaworld_recovery", 180, marks=pytest.mark.metaworld),
     pytest.param("libero", 118, marks=pytest.mark.libero),
+    pytest.param("libero_unscreened", 101, marks=pytest.mark.libero),
 )
 """Two of each study's test scenarios: policies from both starts, and all interventions."""
 
