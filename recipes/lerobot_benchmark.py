@@ -27,7 +27,7 @@ from recipes.study.stored import write_stored_logs
 
 OUT = Path("examples/lerobot_benchmark")
 SETS = ("metaworld_recovery", "libero_recovery")
-STUDIES = ("metaworld_recovery",)
+STUDIES = ("metaworld_recovery", "libero")
 OWNER = "ORG"
 """Stands for the organisation that publishes the sets."""
 ENVHUB_SET = "metaworld_recovery"

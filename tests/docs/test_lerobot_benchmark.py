@@ -93,7 +93,7 @@ def test_the_task_table_counts_the_scenarios():
     assert told == counted
 
 
-@pytest.mark.parametrize("study", ["metaworld_recovery"])
+@pytest.mark.parametrize("study", lerobot_benchmark.STUDIES)
 def test_the_results_are_those_of_the_studies(study):
     """The page's rows stand in the study's page; result files say what the stored outcomes give."""
     root = read_definition(IN_CHECKOUT / study)

