@@ -75,19 +75,29 @@ def kept_tokens(kind: str, folder: Path, names: Sequence[str]) -> dict[str, str]
     return {name: known[name] for name in names}
 
 
-def make_server(app: Any) -> Any:
-    """A uvicorn server of an application; `server.run(sockets=[listener])` runs it until interrupted."""
+def make_server(app: Any, certificate: Path | None = None, key: Path | None = None) -> Any:
+    """A uvicorn server of an application; `server.run(sockets=[listener])` runs it until interrupted.
+
+    Args:
+        app: of ASGI.
+        certificate: PEM file, for TLS.
+        key: of the certificate.
+    """
     import uvicorn
 
-    return uvicorn.Server(
-        uvicorn.Config(
-            app,
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            timeout_graceful_shutdown=2,
-            ws="websockets-sansio",
-            ws_max_size=MAX_SOCKET_MESSAGE_BYTES,
-            lifespan="off",
-        )
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=2,
+        ws="websockets-sansio",
+        ws_max_size=MAX_SOCKET_MESSAGE_BYTES,
+        lifespan="off",
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
     )
+    # Imported here, not in the server's thread: modules of websockets import each other in a circle, and two
+    # threads that begin in different places wait for each other (DeadlockError).
+    config.load()
+    return uvicorn.Server(config)

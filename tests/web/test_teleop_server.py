@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 from lerobot_roborecover.platforms.fake.simulator import FakeSimulator
 from lerobot_roborecover.scenario import ScenarioError
-from lerobot_roborecover.web.serve import MAX_SOCKET_MESSAGE_BYTES
+from lerobot_roborecover.web.serve import MAX_SOCKET_MESSAGE_BYTES, make_server
 from lerobot_roborecover.web.teleop.client import Client, TeleopRefusal
 from lerobot_roborecover.web.teleop.pilot import most_unseen
 from lerobot_roborecover.web.teleop.starts import first_state
@@ -119,6 +119,11 @@ def test_nobody_drives_blind(tmp_path):
 
 def socket_address(address: str, query: str = f"?token={TOKEN}") -> str:
     return address.replace("http://", "ws://").split("?")[0] + "socket" + query
+
+
+def test_a_server_is_imported_before_its_thread_starts():
+    """Two threads that import websockets at once can wait for each other."""
+    assert make_server(lambda: None).config.loaded
 
 
 def test_only_the_page_with_the_token_gets_in(address):

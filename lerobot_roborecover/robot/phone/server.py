@@ -225,11 +225,7 @@ class Phone:
         say(f"console: {self.address}")
         self.door = Door(say)
         app = make_app(console, self.door, hosts, scheme)
-        self._server = make_server(app)
-        if config.tls_certificate:
-            self._server.config.ssl_certfile = str(config.tls_certificate)
-            self._server.config.ssl_keyfile = str(config.tls_key)
-            self._server.config.load()
+        self._server = make_server(app, config.tls_certificate, config.tls_key)
         self._thread = threading.Thread(
             target=self._server.run, kwargs={"sockets": [self._listener]}, daemon=True
         )
