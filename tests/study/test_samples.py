@@ -7,6 +7,7 @@ import functools
 
 import pytest
 
+from lerobot_roborecover.analysis.stats.gains import gains_by_group
 from lerobot_roborecover.analysis.tables import Cell, Column, cell_text
 from recipes.study.definition import read_definition, shipped_study
 from recipes.study.samples import Sample, gains, pairs, rates, read_sample, screening_policies
@@ -57,9 +58,9 @@ def test_the_page_of_the_study_says_what_is_stored():
     tests, sample = sample_of("libero"), sample_of("libero_unscreened")
     screened = screening_policies(read_definition(shipped_study("libero")))
     page = cells(PAGE)
-    for name, _, *values, less in rates(tests, sample, screened).rows:
-        wanted = {*(on_page(v, "percent") for v in values), on_page(less, "points")}
-        assert any(row[0] == name and wanted <= set(row) for row in page), name
+    for name, _, _, _, initial, recovery, less in rates(tests, sample, screened).rows:
+        wanted = [on_page(initial, "percent"), on_page(recovery, "percent"), on_page(less, "points")]
+        assert [name, *wanted] in page
     separated = []
     for name, here, p_here, there, p_there, less in pairs(tests, sample).rows:
         (row,) = (row for row in page if row[0] == name)
@@ -77,12 +78,24 @@ def test_the_page_of_the_study_says_what_is_stored():
 
 @pytest.mark.slow
 def test_the_log_of_the_study_says_what_is_stored():
-    found = sample_of("libero").everyone.recovery
+    """Rates by source and suite, and gains by source: each in the row of its group."""
+    found = sample_of("libero").everyone
     page = cells("docs/log/libero_study.md")
-    for source in ("natural", "perturbed"):
-        (row,) = (row for row in page if row[0] == source)
-        of = [n for n, scenario in enumerate(found.scenarios) if scenario.source == source]
-        (titles,) = (row for row in page if row[0] == "source")
-        rate = dict(zip(found.arms, 100 * found.rates[:, of].mean(axis=1), strict=True))
-        assert int(row[1]) == len(of)
-        assert [f"{rate[name]:.1f}" for name in titles[2:]] == [cell.split()[0] for cell in row[2:]]
+    (arms,) = (row[2:] for row in page if row[0] == "source")
+    panel = found.recovery
+    rates = {name: 100 * panel.rates[n] for n, name in enumerate(panel.arms)}
+    for labels in (panel.labels("source"), panel.labels("suite")):
+        for group in set(labels):
+            (row,) = (row for row in page if row[0] == group)
+            of = [label == group for label in labels]
+            assert int(row[1]) == sum(of)
+            wanted = pytest.approx([rates[name][of].mean() for name in arms], abs=0.0501)  # of one digit
+            assert [float(cell.split()[0]) for cell in row[2:]] == wanted
+    panel = found.interventions
+    (titles,) = (row for row in page if row[0] == "gain, points (p, Holm)")
+    for gain in gains_by_group(
+        panel, found.intervention_pairs, panel.labels("source"), found.resample(panel)
+    ):
+        (place,) = (n for n, title in enumerate(titles) if title == f"{gain.group} ({gain.inside.scenarios})")
+        (row,) = (row for row in page if row[0] == MODES[gain.inside.a] and len(row) == len(titles))
+        assert row[place].startswith(f"{on_page(gain.inside.difference, 'points')} (")

@@ -215,7 +215,7 @@ def test_a_policy_that_fails_is_told_with_the_end_of_its_output(study, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
+@pytest.mark.parametrize("name", ["libero", "libero_0", "metaworld_recovery"])
 def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
     recipe = read_recipe(name)
     found = stages(tmp_path, recipe, chain_for(tmp_path, recipe))
@@ -245,7 +245,7 @@ def test_a_study_whose_policies_are_there_does_not_train_them(tmp_path, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["libero", "metaworld_recovery"])
+@pytest.mark.parametrize("name", ["libero", "libero_0", "metaworld_recovery"])
 def test_a_set_that_ships_need_not_be_built_again(tmp_path, name):
     """Its screening trials do not ship: the panel is tried once more, and is all that is read afterwards."""
     recipe = read_recipe(name)

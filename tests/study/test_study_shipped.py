@@ -17,6 +17,7 @@ SLICES = (
     pytest.param("metaworld_recovery", 180, marks=pytest.mark.metaworld),
     pytest.param("libero", 118, marks=pytest.mark.libero),
     pytest.param("libero_unscreened", 101, marks=pytest.mark.libero),
+    pytest.param("libero_0", 100, marks=pytest.mark.libero),
 )
 """Two of each study's test scenarios: policies from both starts, and all interventions."""
 
