@@ -255,7 +255,8 @@ def draw_curve(folder: Path) -> Path:
         plot, axes = subplots(6.4, 3.6)
         for i, source in enumerate(SOURCES):
             arms = [NONE, *(f"{source}_{minutes}" for minutes in MINUTES)]
-            for k, (label, values) in enumerate(zip(("recovery points", "first states"), rates, strict=True)):
+            for k, values in enumerate(rates):
+                label = ("recovery points", "initial states")[k]
                 shown = [(place, values[arm]) for place, arm in enumerate(arms) if arm in values]
                 places = [place + 0.06 * (i - 1) for place, _ in shown]
                 middle = [100 * value["value"] for _, value in shown]
@@ -270,7 +271,7 @@ def draw_curve(folder: Path) -> Path:
         axes.set_ylabel("success, %")
         axes.set_ylim(0, 100)
         axes.grid(color=LINE, lw=0.6)
-        axes.legend(loc="lower left", fontsize=7)
+        axes.legend(loc="lower left", fontsize=7, handlelength=4)
         path = folder / "recovery_per_hour.svg"
         path.write_bytes(svg_of(plot))
     return path

@@ -89,21 +89,29 @@ def test_the_page_on_detectors_says_what_is_stored(name):
             assert f"| `{detector.name}` | {shown} |" in page
 
 
+TRAININGS = [
+    # page, stored outcomes, trials of a run from recovery points
+    ("recovery_data", RECOVERY_DATA, 359),
+    ("recovery_per_hour", OUTCOMES / "recovery_per_hour_metaworld", 161),
+]
+
+
 @pytest.mark.slow
-def test_the_page_on_training_on_recoveries_says_what_is_stored():
-    page = (DOCS / "studies" / "recovery_data.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(("name", "stored", "scenarios"), TRAININGS, ids=[s.name for _, s, _ in TRAININGS])
+def test_the_pages_on_correction_data_say_what_is_stored(name, stored, scenarios):
+    page = (DOCS / "studies" / f"{name}.md").read_text(encoding="utf-8")
     rates: dict[str, list[str]] = {}
     trials = 0
-    for run, log in stored_logs(RECOVERY_DATA).items():
+    for run, log in stored_logs(stored).items():
         rows = read_trial_log(log)
         trials += len(rows)
         success = {r.scenario_id: r.success for r in rows if r.start == "recovery"}
-        assert len(success) == 359
+        assert len(success) == scenarios
         rates.setdefault(run.rpartition("_")[0], []).append(rate_of(success))
     assert f"{trials:,} trials" in page
-    for mixture, of in rates.items():
-        row = next(line for line in page.splitlines() if line.startswith(f"| `{mixture}` | ") and "[" in line)
-        assert f"| {', '.join(of)} |" in row
+    for method, runs in rates.items():
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{method}` | ") and "[" in line)
+        assert f"| {', '.join(runs)} |" in row
 
 
 def test_the_page_on_the_simulated_lab_says_what_is_stored():

@@ -67,7 +67,7 @@ def test_the_curve_has_a_line_for_each_source(tmp_path):
     drawn = draw_curve(tmp_path).read_text()
     for source in ("donors", "takeover", "forks"):
         assert f"<!-- {source}, recovery points -->" in drawn
-        assert f"<!-- {source}, first states -->" in drawn
+        assert f"<!-- {source}, initial states -->" in drawn
 
 
 @pytest.mark.nightly
