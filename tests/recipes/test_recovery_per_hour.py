@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,18 @@ from lerobot_roborecover.scenario import Start
 from recipes.corrections import forks
 from recipes.episodes import ACTION, REWARD, frames_of
 from recipes.learned import LearnedPolicy
-from recipes.recovery_per_hour import ARMS, SUBJECTS, Study, draw_curve, repeated, until
+from recipes.outcomes import OUTCOMES, method_rates, stored_logs
+from recipes.recovery_per_hour import (
+    ARMS,
+    FIRST_LOOK,
+    NONE,
+    SUBJECTS,
+    Study,
+    draw_curve,
+    repeated,
+    report,
+    until,
+)
 from tests.recipes.test_episodes import some
 
 SUBJECT = SUBJECTS["metaworld"]
@@ -114,3 +126,49 @@ def test_an_operator_goes_on_from_where_the_policy_is(platform, base, task):
         assert episode.columns[REWARD][-1] == 1.0
         assert episode.columns[REWARD][0] == 0.0
         assert np.abs(episode.columns[ACTION]).max() <= 1.0
+
+
+def gain_over_none(table: Path) -> dict[str, tuple[str, float, str]]:
+    """By arm, of a report's table: RSR less that of `none` in points, p, and the verdict on the arm."""
+    found = {}
+    for row in csv.DictReader(table.open(encoding="utf-8")):
+        if NONE not in (row["A"], row["B"]):
+            continue
+        name = "RSR, A − B, runs like these"
+        value, low, high = (100 * float(row[column]) for column in (name, f"{name} low", f"{name} high"))
+        better, worse = "better", "worse"
+        if row["A"] == NONE:
+            value, low, high, better, worse = -value, -high, -low, worse, better
+        verdict = {"A is better": better, "B is better": worse}.get(row["Verdict on the methods"])
+        found[row["B"] if row["A"] == NONE else row["A"]] = (
+            f"{value:+.1f} [{low:.1f}, {high:.1f}]", float(row["p (Holm)"]), verdict or "not separated",
+        )  # fmt: skip
+    return found
+
+
+@pytest.mark.slow
+def test_the_page_says_what_a_report_on_the_stored_outcomes_does(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "studies" / "recovery_per_hour.md").read_text("utf-8")
+    report(stored_logs(OUTCOMES / "recovery_per_hour_metaworld"), tmp_path)
+    everything, primary = (tmp_path / "report" / name for name in ("all", "primary"))
+    gains, planned = (gain_over_none(of / "tables" / "method_contrasts.csv") for of in (everything, primary))
+    assert set(planned) == set(FIRST_LOOK) - {NONE}
+    assert set(gains) == set(ARMS) - {NONE}
+    rates = method_rates(everything)
+    for arm in ARMS:
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{arm}` | ") and "[" in line)
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        recovery, initial = (
+            f"{100 * of[arm]['value']:.1f} [{100 * of[arm]['low']:.1f}, {100 * of[arm]['high']:.1f}]"
+            for of in rates
+        )
+        assert (cells[1], cells[3]) == (recovery, initial)
+        if arm == NONE:
+            continue
+        assert cells[4] == gains[arm][0]
+        if arm in planned:
+            gain, p, verdict = planned[arm]
+            assert (cells[4], cells[6]) == (gain, verdict)
+            assert float(cells[5]) == pytest.approx(p, rel=0.1)
+        else:
+            assert cells[5:] == ["", ""]
