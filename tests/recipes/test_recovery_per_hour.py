@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from importlib import import_module
 from pathlib import Path
 
@@ -147,16 +148,18 @@ def gain_over_none(table: Path) -> dict[str, tuple[str, float, str]]:
 
 
 @pytest.mark.slow
-def test_the_page_says_what_a_report_on_the_stored_outcomes_does(tmp_path):
+@pytest.mark.parametrize(("platform", "heading"), [("metaworld", "### Meta-World, ")])
+def test_the_page_says_what_a_report_on_the_stored_outcomes_does(tmp_path, platform, heading):
     page = (Path(__file__).parents[2] / "docs" / "studies" / "recovery_per_hour.md").read_text("utf-8")
-    report(stored_logs(OUTCOMES / "recovery_per_hour_metaworld"), tmp_path)
+    (section,) = (part for part in re.split("^(?=#)", page, flags=re.MULTILINE) if part.startswith(heading))
+    report(stored_logs(OUTCOMES / f"recovery_per_hour_{platform}"), tmp_path)
     everything, primary = (tmp_path / "report" / name for name in ("all", "primary"))
     gains, planned = (gain_over_none(of / "tables" / "method_contrasts.csv") for of in (everything, primary))
     assert set(planned) == set(FIRST_LOOK) - {NONE}
     assert set(gains) == set(ARMS) - {NONE}
     rates = method_rates(everything)
     for arm in ARMS:
-        row = next(line for line in page.splitlines() if line.startswith(f"| `{arm}` | ") and "[" in line)
+        row = next(line for line in section.splitlines() if line.startswith(f"| `{arm}` | ") and "[" in line)
         cells = [cell.strip() for cell in row.strip("|").split("|")]
         recovery, initial = (
             f"{100 * of[arm]['value']:.1f} [{100 * of[arm]['low']:.1f}, {100 * of[arm]['high']:.1f}]"
