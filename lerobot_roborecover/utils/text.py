@@ -48,12 +48,14 @@ def install_command(extra: str, name: str = DISTRIBUTION) -> str:
         extra: its name; empty for the package itself.
         name: of the distribution.
     """
-    from importlib.metadata import PackageNotFoundError, distribution
+    from importlib.metadata import distributions
 
     extras = f"[{extra}]" if extra else ""
+    # In the folder of a clone its build's own metadata is found first, which does not say where it came from.
+    found = (d.read_text("direct_url.json") for d in distributions(name=name))
     try:
-        source = json.loads(distribution(name).read_text("direct_url.json") or "{}")
-    except (PackageNotFoundError, ValueError):
+        source = json.loads(next(filter(None, found), "{}"))
+    except ValueError:
         source = {}
     if source.get("dir_info", {}).get("editable"):
         return f"uv pip install -e '{unquote(urlsplit(source['url']).path)}{extras}'"

@@ -14,6 +14,7 @@ from recipes.intervention_timing import ARMS, stored_folder
 from recipes.metaworld.recovery_data import STORED as RECOVERY_DATA
 from recipes.outcomes import OUTCOMES, store_logs, stored_logs
 from recipes.robot_lab.__main__ import FILES, STORED, tables
+from tests.support.doc_blocks import section
 from tests.support.trial_rows import policy_rows, write_log
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -90,16 +91,19 @@ def test_the_page_on_detectors_says_what_is_stored(name):
 
 
 TRAININGS = [
-    # page, stored outcomes, trials of a run from recovery points
-    ("recovery_data", RECOVERY_DATA, 359),
-    ("recovery_per_hour", OUTCOMES / "recovery_per_hour_metaworld", 161),
+    # page, its section, stored outcomes, trials of a run from recovery points
+    ("recovery_data", "## Results", RECOVERY_DATA, 359),
+    ("recovery_per_hour", "### Meta-World, ", OUTCOMES / "recovery_per_hour_metaworld", 161),
+    ("recovery_per_hour", "### LIBERO, ", OUTCOMES / "recovery_per_hour_libero", 86),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "stored", "scenarios"), TRAININGS, ids=[s.name for _, s, _ in TRAININGS])
-def test_the_pages_on_correction_data_say_what_is_stored(name, stored, scenarios):
-    page = (DOCS / "studies" / f"{name}.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("name", "heading", "stored", "scenarios"), TRAININGS, ids=[stored.name for *_, stored, _ in TRAININGS]
+)
+def test_the_pages_on_correction_data_say_what_is_stored(name, heading, stored, scenarios):
+    page = section((DOCS / "studies" / f"{name}.md").read_text(encoding="utf-8"), heading)
     rates: dict[str, list[str]] = {}
     trials = 0
     for run, log in stored_logs(stored).items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from importlib import import_module
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from recipes.recovery_per_hour import (
     until,
 )
 from tests.recipes.test_episodes import some
+from tests.support.doc_blocks import section
 
 SUBJECT = SUBJECTS["metaworld"]
 
@@ -148,10 +148,12 @@ def gain_over_none(table: Path) -> dict[str, tuple[str, float, str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("platform", "heading"), [("metaworld", "### Meta-World, ")])
+@pytest.mark.parametrize(
+    ("platform", "heading"), [("metaworld", "### Meta-World, "), ("libero", "### LIBERO, ")]
+)
 def test_the_page_says_what_a_report_on_the_stored_outcomes_does(tmp_path, platform, heading):
     page = (Path(__file__).parents[2] / "docs" / "studies" / "recovery_per_hour.md").read_text("utf-8")
-    (section,) = (part for part in re.split("^(?=#)", page, flags=re.MULTILINE) if part.startswith(heading))
+    rows = section(page, heading).splitlines()
     report(stored_logs(OUTCOMES / f"recovery_per_hour_{platform}"), tmp_path)
     everything, primary = (tmp_path / "report" / name for name in ("all", "primary"))
     gains, planned = (gain_over_none(of / "tables" / "method_contrasts.csv") for of in (everything, primary))
@@ -159,7 +161,7 @@ def test_the_page_says_what_a_report_on_the_stored_outcomes_does(tmp_path, platf
     assert set(gains) == set(ARMS) - {NONE}
     rates = method_rates(everything)
     for arm in ARMS:
-        row = next(line for line in section.splitlines() if line.startswith(f"| `{arm}` | "))
+        row = next(line for line in rows if line.startswith(f"| `{arm}` | "))
         cells = [cell.strip() for cell in row.strip("|").split("|")]
         recovery, initial = (
             f"{100 * of[arm]['value']:.1f} [{100 * of[arm]['low']:.1f}, {100 * of[arm]['high']:.1f}]"

@@ -42,7 +42,10 @@ def targets_of(robot):
 
 def test_it_needs_its_package(monkeypatch, tmp_path):
     monkeypatch.setattr("lerobot_roborecover.robot.lab.so101_world.find_spec", lambda name: None)
-    with pytest.raises(OptionError, match="its arm is not here: pip install"), lab(tmp_path, world="so101"):
+    with (
+        pytest.raises(OptionError, match=r"its arm is not here: (uv )?pip install"),
+        lab(tmp_path, world="so101"),
+    ):
         pass
 
 

@@ -35,6 +35,12 @@ class Block:
         return f"{self.page}:{self.line}"
 
 
+def section(page: str, heading: str) -> str:
+    """The one part of a page, up to the next heading, whose heading begins like this."""
+    (found,) = (part for part in re.split("^(?=#)", page, flags=re.MULTILINE) if part.startswith(heading))
+    return found
+
+
 def blocks_of(page: Path) -> list[Block]:
     """All blocks of a page, in order."""
     text = page.read_text("utf-8")
